@@ -1,0 +1,53 @@
+"""Data shipped with the package."""
+
+import csv
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+__all__ = ["Conductors", "load_conductors"]
+
+
+@dataclass(frozen=True)
+class Conductors:
+    """Complex indices of refraction eta + i k of real conductors, as linear sRGB.
+
+    `names` has n entries; `eta` and `k` are (n, 3) float64, unitless, eta in .038 .. 7.51 and k in .114 .. 9.22; `held_out` is
+    (n,) bool, true for the metals that training never sees. Arrays are read-only.
+    """
+
+    names: tuple[str, ...]
+    eta: np.ndarray
+    k: np.ndarray
+    held_out: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def distinct(self) -> np.ndarray:
+        """Row numbers, ascending, of one row per different (eta, k): the corpus lists some substances twice."""
+        _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
+        return np.sort(first)
+
+
+@cache
+def load_conductors() -> Conductors:
+    """The metals of `conductors.csv` (Mitsuba's data/ior; see tools/make_conductors.py), in file order."""
+    lines = files(__name__).joinpath("conductors.csv").read_text(encoding="utf-8").splitlines()
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+
+    def columns(*keys: str) -> np.ndarray:
+        values = np.array([[float(row[key]) for key in keys] for row in rows])
+        values.flags.writeable = False
+        return values
+
+    held_out = columns("held_out")[:, 0] > 0
+    held_out.flags.writeable = False
+    return Conductors(
+        names=tuple(row["name"] for row in rows),
+        eta=columns("eta_r", "eta_g", "eta_b"),
+        k=columns("k_r", "k_g", "k_b"),
+        held_out=held_out,
+    )

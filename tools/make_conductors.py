@@ -1,0 +1,69 @@
+"""Write nma/data/conductors.csv: real metals as linear sRGB indices of refraction.
+
+    python tools/make_conductors.py [OUT.csv]
+
+Every spectrum in Mitsuba's `data/ior` goes through Mitsuba's own projection to linear sRGB (unbounded, as its `conductor`
+plugin does it). Transparent crystals (an absorption k near 0) and spectra whose projection had to clamp a negative channel
+are no metals for our purpose and are dropped.
+"""
+
+import argparse
+import csv
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+OUT = Path(__file__).parents[1] / "nma" / "data" / "conductors.csv"
+HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
+
+# A conductor that absorbs less than this in any channel is a tinted dielectric; the next one above has .114.
+MIN_K = 0.1
+
+# Kept out of training to test unseen metals: an alkali, a refractory, a bright and a liquid metal, a gold-like nitride, one whose
+# eta rises towards blue, a weakly absorbing oxide, amorphous carbon. The corpus lists many substances twice (`Hg`, `Hg_palik`):
+# all rows of a substance go together, or the test would see training data.
+HELD_OUT = ("Na", "W", "Rh", "Hg", "TiN", "Ta", "Cu2O", "a-C")
+
+
+def substance(name: str) -> str:
+    """The substance of a data file: `Hg_palik` is `Hg`, `Te-e` (extraordinary ray) is `Te`."""
+    return name.removesuffix("_palik").removesuffix("-e")
+
+
+def project(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Linear sRGB (eta, k), each (3,), of the conductor `name` as Mitsuba's plugin holds it."""
+    values = mi.traverse(mi.load_dict({"type": "conductor", "material": name}))
+    return np.array(values["eta.value"], float).ravel(), np.array(values["k.value"], float).ravel()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", nargs="?", type=Path, default=OUT)
+    out = parser.parse_args().out
+
+    mi.set_variant("scalar_rgb")
+    mi.set_log_level(mi.LogLevel.Error)  # it warns of every colour it clamps
+    files = (Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")
+    names = sorted((f.name.removesuffix(".eta.spd") for f in files), key=lambda name: (name.lower(), name))
+
+    kept = 0
+    with out.open("w", newline="") as stream:
+        stream.write(
+            f"# Linear sRGB (eta, k) of Mitsuba {mi.__version__} data/ior; written by tools/make_conductors.py\n"
+        )
+        rows = csv.writer(stream, lineterminator="\n")
+        rows.writerow(HEADER)
+        for name in names:
+            eta, k = project(name)
+            if eta.min() > 0 and k.min() > MIN_K:
+                numbers = (f"{x:.7g}" for x in (*eta, *k))
+                rows.writerow((name, *numbers, int(substance(name) in HELD_OUT)))
+                kept += 1
+    print(f"{out}: {kept} of {len(names)} conductors")
+
+
+if __name__ == "__main__":
+    main()
