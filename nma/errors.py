@@ -1,0 +1,33 @@
+"""Errors that users meet. Each message says what is wrong, where, and what to do next."""
+
+
+class NmaError(Exception):
+    """Base of all errors raised on purpose by this package; the command line prints them without a traceback."""
+
+
+class ParamError(NmaError, ValueError):
+    """A source parameter is missing, has the wrong shape, is not finite, or lies outside its range."""
+
+
+class MaterialError(NmaError, ValueError):
+    """A material name is unknown, or a material file is malformed."""
+
+
+class TextureError(NmaError, ValueError):
+    """A texture cannot be read, or holds values that its parameter does not allow."""
+
+
+class WeightsError(NmaError, ValueError):
+    """A weights file is missing, truncated, of another format, or of another class."""
+
+
+class DatasetError(NmaError, ValueError):
+    """A dataset is damaged, incomplete, or was made with other settings."""
+
+
+class TableError(NmaError, ValueError):
+    """A table or reference file (.npz) is damaged or has the wrong shape."""
+
+
+class MissingDependencyError(NmaError, ImportError):
+    """A library this feature needs is missing or too old."""

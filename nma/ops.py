@@ -1,0 +1,201 @@
+"""Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written once (CONVENTIONS.md).
+
+Each function looks at its arguments and calls the library they belong to; plain Python numbers go to NumPy. Code built on
+this module never branches on values: it uses `select`. `Vec3` is a triple of such arrays, a direction or an RGB colour.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Float = Any  # one number per lane: a Dr.Jit, JAX or NumPy array, or a Python float
+Mask = Any  # one truth value per lane
+
+PI = math.pi
+INV_PI = 1.0 / math.pi
+
+
+def _library(*args: Any) -> str:
+    """Name of the array library that owns the arguments: "drjit", "jax" or "numpy"."""
+    for a in args:
+        module = type(a).__module__
+        if module.startswith(("drjit", "mitsuba")):
+            return "drjit"
+        if module.startswith("jax"):
+            return "jax"
+    return "numpy"
+
+
+def _module(*args: Any) -> Any:
+    """The array library itself, imported only when an argument of its own shows that it is in use."""
+    library = _library(*args)
+    if library == "drjit":
+        import drjit
+
+        return drjit
+    if library == "jax":
+        import jax.numpy
+
+        return jax.numpy
+    return np
+
+
+def sqrt(x: Float) -> Float:
+    return _module(x).sqrt(x)
+
+
+def safe_sqrt(x: Float) -> Float:
+    """sqrt(max(x, 0)) whose derivative at 0 is 0 instead of infinite."""
+    positive = x > 0
+    return select(positive, sqrt(select(positive, x, 1.0)), 0.0)
+
+
+def exp(x: Float) -> Float:
+    return _module(x).exp(x)
+
+
+def log(x: Float) -> Float:
+    return _module(x).log(x)
+
+
+def log1p(x: Float) -> Float:
+    m = _module(x)
+    return m.log(1.0 + x) if m.__name__ == "drjit" else m.log1p(x)
+
+
+def sin(x: Float) -> Float:
+    return _module(x).sin(x)
+
+
+def cos(x: Float) -> Float:
+    return _module(x).cos(x)
+
+
+def tan(x: Float) -> Float:
+    return _module(x).tan(x)
+
+
+def atan(x: Float) -> Float:
+    m = _module(x)
+    return m.atan(x) if m.__name__ == "drjit" else m.arctan(x)
+
+
+def atan2(y: Float, x: Float) -> Float:
+    m = _module(y, x)
+    return m.atan2(y, x) if m.__name__ == "drjit" else m.arctan2(y, x)
+
+
+def absolute(x: Float) -> Float:
+    return _module(x).abs(x)
+
+
+def minimum(a: Float, b: Float) -> Float:
+    return _module(a, b).minimum(a, b)
+
+
+def maximum(a: Float, b: Float) -> Float:
+    return _module(a, b).maximum(a, b)
+
+
+def clip(x: Float, low: float, high: float) -> Float:
+    return minimum(maximum(x, low), high)
+
+
+def floor(x: Float) -> Float:
+    return _module(x).floor(x)
+
+
+def select(condition: Mask, a: Float, b: Float) -> Float:
+    """`a` where the condition holds, else `b`. Works on a `Vec3` too."""
+    if isinstance(a, Vec3) or isinstance(b, Vec3):
+        a, b = Vec3.of(a), Vec3.of(b)
+        return Vec3(*(select(condition, p, q) for p, q in zip(a, b, strict=True)))
+    m = _module(condition, a, b)
+    return m.select(condition, a, b) if m.__name__ == "drjit" else m.where(condition, a, b)
+
+
+def copysign(magnitude: Float, sign: Float) -> Float:
+    return select(sign < 0, -absolute(magnitude), absolute(magnitude))
+
+
+def detach(x: Float) -> Float:
+    """The value without its derivative."""
+    library = _library(x)
+    if library == "drjit":
+        import drjit
+
+        return drjit.detach(x)
+    if library == "jax":
+        import jax
+
+        return jax.lax.stop_gradient(x)
+    return x
+
+
+def lerp(a: Float, b: Float, t: Float) -> Float:
+    return a + (b - a) * t
+
+
+class Vec3(NamedTuple):
+    """A direction or an RGB colour: three arrays of equal shape, with elementwise arithmetic."""
+
+    x: Float
+    y: Float
+    z: Float
+
+    @staticmethod
+    def of(value: Float | Vec3) -> Vec3:
+        """`value` itself if it is a `Vec3`, else the grey triple (value, value, value)."""
+        return value if isinstance(value, Vec3) else Vec3(value, value, value)
+
+    def __add__(self, other):
+        o = Vec3.of(other)
+        return Vec3(self.x + o.x, self.y + o.y, self.z + o.z)
+
+    def __sub__(self, other):
+        o = Vec3.of(other)
+        return Vec3(self.x - o.x, self.y - o.y, self.z - o.z)
+
+    def __mul__(self, other):
+        o = Vec3.of(other)
+        return Vec3(self.x * o.x, self.y * o.y, self.z * o.z)
+
+    def __truediv__(self, other):
+        o = Vec3.of(other)
+        return Vec3(self.x / o.x, self.y / o.y, self.z / o.z)
+
+    def __neg__(self):
+        return Vec3(-self.x, -self.y, -self.z)
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+    def __rsub__(self, other):
+        return Vec3.of(other) - self
+
+
+Color = Vec3
+
+
+def dot(a: Vec3, b: Vec3) -> Float:
+    return a.x * b.x + a.y * b.y + a.z * b.z
+
+
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    return Vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
+
+
+def normalize(v: Vec3) -> Vec3:
+    return v * (1.0 / sqrt(dot(v, v)))
+
+
+def max_component(c: Vec3) -> Float:
+    return maximum(maximum(c.x, c.y), c.z)
+
+
+def luminance(c: Vec3) -> Float:
+    """Luminance of linear sRGB (ITU-R BT.709 primaries)."""
+    return 0.212671 * c.x + 0.715160 * c.y + 0.072169 * c.z

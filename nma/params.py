@@ -1,0 +1,170 @@
+"""Parameters of source materials: one declaration per class drives sampling, inputs, textures, options, docs and exports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nma.data import load_conductors
+from nma.errors import ParamError
+
+Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
+Population = Literal["mixed", "range", "metals", "held_out_metals"]
+Bounds = Literal["training", "valid"]
+
+
+@dataclass(frozen=True)
+class Param:
+    """One parameter of a class: a number (size 1) or an RGB triple (size 3).
+
+    `law` says how training draws it: uniformly, as 10 to a uniform power, as 1 - U^2, or "conductor", the mixture of
+    real metals and uniform draws that CONVENTIONS.md describes. `low`..`high` is the training range, `valid_low`..
+    `valid_high` what is physically meaningful; sources accept the latter, adapters only the former.
+    """
+
+    name: str
+    symbol: str
+    law: Law
+    low: float
+    high: float
+    valid_low: float
+    valid_high: float
+    description: str
+    size: int = 1
+
+    def normalise(self, x):
+        """Maps the training range to [0, 1]: linearly, or by the logarithm where the law is logarithmic."""
+        if self.law == "log10":
+            from nma import ops
+
+            span = np.log(self.high / self.low)
+            return ops.log(x / self.low) * float(1.0 / span)
+        return (x - self.low) / (self.high - self.low)
+
+    def draw(self, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+        """(n, size) values drawn by the law, a conductor's channels uniformly."""
+        u = rng.random((n, self.size))
+        if self.law == "log10":
+            return 10.0 ** (np.log10(self.low) + u * np.log10(self.high / self.low))
+        if self.law == "one_minus_square":
+            return 1.0 - u * u
+        return self.low + u * (self.high - self.low)
+
+    def bounds(self, kind: Bounds) -> tuple[float, float]:
+        return (self.low, self.high) if kind == "training" else (self.valid_low, self.valid_high)
+
+
+@dataclass(frozen=True)
+class ParamSpace:
+    """The parameters of a class, in the order of its vectors' columns."""
+
+    name: str
+    params: tuple[Param, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of columns of a parameter vector."""
+        return sum(p.size for p in self.params)
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Where each parameter lies in a vector."""
+        ends = np.cumsum([p.size for p in self.params])
+        return {p.name: slice(int(e) - p.size, int(e)) for p, e in zip(self.params, ends, strict=True)}
+
+    def __getitem__(self, name: str) -> Param:
+        for p in self.params:
+            if p.name == name:
+                return p
+        raise ParamError(f"class {self.name} has no parameter '{name}'; it has {', '.join(p.name for p in self.params)}")
+
+    def vector(self, values: dict[str, ArrayLike]) -> NDArray[np.float64]:
+        """A vector (size,) from named values; a number given for an RGB parameter means grey."""
+        unknown = set(values) - {p.name for p in self.params}
+        missing = [p.name for p in self.params if p.name not in values]
+        if unknown or missing:
+            raise ParamError(
+                f"class {self.name}: "
+                + "; ".join(
+                    [f"unknown parameter '{u}'" for u in sorted(unknown)] + [f"missing parameter '{m}'" for m in missing]
+                )
+            )
+        out = np.empty(self.size)
+        for name, columns in self.slices.items():
+            value = np.asarray(values[name], np.float64)
+            if value.ndim > 1 or value.size not in (1, columns.stop - columns.start):
+                raise ParamError(f"{name} wants {columns.stop - columns.start} number(s), got shape {value.shape}")
+            out[columns] = value
+        return out
+
+    def check(self, params: ArrayLike, bounds: Bounds = "valid", clamp: bool = False) -> NDArray[np.float64]:
+        """Returns `params` as float64 (n, size), or raises `ParamError` that names the first fault.
+
+        With `clamp`, values beyond the bounds are moved to them instead; what is not finite is refused all the same.
+        """
+        p = np.atleast_2d(np.asarray(params, np.float64))
+        if p.ndim != 2 or p.shape[1] != self.size:
+            raise ParamError(f"parameters of class {self.name} have shape (n, {self.size}), got {np.shape(params)}")
+        for param in self.params:
+            columns = self.slices[param.name]
+            low, high = param.bounds(bounds)
+            values = p[:, columns]
+            tolerance = 1e-6 * (high - low) if np.isfinite(high) else 0.0
+            bad = ~np.isfinite(values)
+            if not clamp:
+                bad |= (values < low - tolerance) | (values > high + tolerance)
+            if bad.any():
+                row = int(np.nonzero(bad.any(axis=1))[0][0])
+                hint = f"; an adapter only knows its {bounds} range, clamp to it if that is meant" if bounds == "training" else ""
+                raise ParamError(
+                    f"{param.name} ({param.symbol}) of material {row} is {values[row].tolist()}, "
+                    f"allowed is {low:g} .. {high:g}{hint}"
+                )
+        if clamp:
+            low, high = self.columns(bounds)
+            p = np.clip(p, low, high)
+        return p
+
+    def columns(self, bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bound of every column."""
+        pairs = np.array([p.bounds(bounds) for p in self.params for _ in range(p.size)])
+        return pairs[:, 0], pairs[:, 1]
+
+    def sample(self, rng: np.random.Generator, n: int, population: Population = "mixed") -> NDArray[np.float64]:
+        """(n, size) parameter vectors drawn by each parameter's law.
+
+        For classes with a conductor, `population` chooses where (eta, k) come from: "range" draws every channel
+        uniformly, "metals" takes real metals other than those held out, "held_out_metals" takes those, and "mixed",
+        what training uses, takes half of each of the first two.
+        """
+        out = np.concatenate([p.draw(rng, n) for p in self.params], axis=1)
+        if not any(p.law == "conductor" for p in self.params) or population == "range":
+            return out
+        metals = load_conductors()
+        pool = np.nonzero(metals.held_out == (population == "held_out_metals"))[0]
+        pick = pool[rng.integers(len(pool), size=n)]
+        rows = rng.random(n) < 0.5 if population == "mixed" else np.ones(n, bool)
+        out[rows, self.slices["eta_conductor"]] = metals.eta[pick[rows]]
+        out[rows, self.slices["k_conductor"]] = metals.k[pick[rows]]
+        return out
+
+
+_INF = float("inf")
+
+LAYERED3 = ParamSpace(
+    "layered3",
+    (
+        Param("alpha_top", "alpha_1", "log10", 1e-3, 10**-0.5, 1e-4, 1.0, "microfacet width of the coat"),
+        Param("alpha_bottom", "alpha_2", "log10", 1e-3, 1.0, 1e-4, 1.0, "microfacet width of the conductor"),
+        Param("eta_top", "eta_1", "uniform", 1.05, 2.0, 1.0, 4.0, "refractive index of the coat"),
+        Param("eta_conductor", "eta", "conductor", 0.03, 7.6, 0.0, _INF, "real part of the conductor's index", 3),
+        Param("k_conductor", "kappa", "conductor", 0.0, 9.5, 0.0, _INF, "imaginary part of the conductor's index", 3),
+        Param("albedo", "rho", "one_minus_square", 0.0, 1.0, 0.0, 1.0, "single-scattering albedo of the medium", 3),
+        Param("sigma_t", "sigma_t", "uniform", 0.0, 1.0, 0.0, _INF, "optical depth of the medium (thickness 1)"),
+    ),
+)
+
+SPACES = {LAYERED3.name: LAYERED3}

@@ -1,0 +1,63 @@
+"""What a source of appearance offers to the rest of the package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from nma.ops import Color, Float, Mask, Vec3
+from nma.params import ParamSpace
+
+
+class Random(Protocol):
+    """A stream of random numbers, one per lane, such as Dr.Jit's PCG32."""
+
+    def next_float32(self) -> Float:
+        """Uniform in [0, 1)."""
+        ...
+
+
+@dataclass
+class Walk:
+    """One random walk per lane, in a form that Dr.Jit's symbolic loops can carry.
+
+    While `alive`, `direction` is where the walk is heading; once it is over and `throughput` is positive, it is wo, the
+    direction in which it left (z > 0). A walk that was absorbed has throughput 0.
+    """
+
+    direction: tuple[Float, Float, Float]
+    throughput: tuple[Float, Float, Float]
+    height: Float  # 1 at the top of the slab, 0 at its bottom
+    inside: Mask  # has entered the material
+    alive: Mask
+
+    @staticmethod
+    def arriving_from(wi: Vec3) -> Walk:
+        """A walk about to meet the surface from `wi` (wi.z > 0), throughput 1."""
+        one = wi.x * 0.0 + 1.0
+        toward = -wi
+        return Walk(tuple(toward), (one, one, one), one, one < 0.5, one > 0.5)
+
+
+class Source(Protocol):
+    """A stochastic appearance model g(wi) -> (wo, throughput), paper eq. 8, one event at a time.
+
+    The mean of the throughput over all walks that leave through a set of directions is the integral of f cos(theta_o)
+    over that set. A model that only knows its f draws wo from a density p at the first event and returns
+    f cos(theta_o) / p. Throughputs never exceed 1: tables count in fixed point.
+    """
+
+    space: ParamSpace
+
+    def gather(self, columns: list[Any]) -> Any:
+        """The parameters in the form `step` wants, from one array per column of the class's parameter vector."""
+        ...
+
+    def step(self, params: Any, walk: Walk, rng: Random) -> Walk:
+        """Advances every walk by one event. Lanes whose walk is over may return anything: callers mask them."""
+        ...
+
+
+def throughput(walk: Walk) -> Color:
+    """The walk's throughput as a colour."""
+    return Color(*walk.throughput)

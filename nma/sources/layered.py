@@ -1,0 +1,120 @@
+"""Position-free random walks through a rough dielectric over a homogeneous medium over a rough conductor.
+
+Guo, Hasan and Zhao 2018, "Position-Free Monte Carlo Simulation for Arbitrary Layered BSDFs". Only depth matters, so a
+walk is a direction, a height in a slab of thickness 1, and a throughput. Dr.Jit alone, no renderer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from nma import ops
+from nma.microfacet import (
+    fresnel_conductor_rgb,
+    fresnel_dielectric,
+    reflect,
+    refract,
+    sample_visible_normal,
+    smith_g1,
+)
+from nma.ops import Color, Float, Vec3
+from nma.params import LAYERED3
+from nma.sources.base import Random, Walk
+
+# Walks whose brightest channel falls below this are continued with a chance in proportion to it.
+ROULETTE_THRESHOLD = 0.25
+
+
+@dataclass
+class Layers:
+    """The stack, one value per lane. Indices of the conductor are relative to the coat it lies in."""
+
+    alpha_top: Float
+    alpha_bottom: Float
+    eta_top: Float
+    eta_bottom: tuple[Float, Float, Float]
+    k_bottom: tuple[Float, Float, Float]
+    albedo: tuple[Float, Float, Float]
+    sigma_t: Float
+
+
+class Layered3:
+    """The class `layered3` (paper Table 1) as a source."""
+
+    space = LAYERED3
+
+    def gather(self, columns: list[Any]) -> Layers:
+        """Layers from the 13 columns of the class's parameter vector."""
+        alpha_top, alpha_bottom, eta_top, *rest = columns
+        eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
+        # The conductor's Fresnel term sees the index of the coat, not that of air.
+        inv = 1.0 / eta_top
+        return Layers(
+            alpha_top,
+            alpha_bottom,
+            eta_top,
+            tuple(e * inv for e in eta),
+            tuple(x * inv for x in k),
+            tuple(albedo),
+            sigma_t,
+        )
+
+    def step(self, params: Layers, walk: Walk, rng: Random) -> Walk:
+        """One free flight and one event: scattering in the medium, or reflection or refraction at an interface."""
+        u_flight, u_lobe = rng.next_float32(), rng.next_float32()
+        u1, u2 = rng.next_float32(), rng.next_float32()
+        d = Vec3(*walk.direction)
+        upward = walk.inside & (d.z > 0)
+        at_bottom = walk.inside & (d.z <= 0)
+
+        # Fly to the next event: somewhere in the medium, or the interface ahead.
+        optical_depth = -dr.log(1.0 - u_flight)
+        height = walk.height + d.z * (optical_depth / dr.maximum(params.sigma_t, 1e-20))
+        in_medium = walk.inside & (params.sigma_t > 0) & (height > 0) & (height < 1)
+
+        # At an interface, look at it from the side the walk is on, with the normal toward that side.
+        alpha = dr.select(at_bottom, params.alpha_bottom, params.alpha_top)
+        w = Vec3(-d.x, -d.y, dr.maximum(dr.abs(d.z), 1e-7))
+        m = sample_visible_normal(w, alpha, alpha, u1, u2)
+        cos_m = dr.maximum(ops.dot(w, m), 0.0)
+
+        # The coat reflects by chance in proportion to its Fresnel term, the conductor always and with its colour.
+        eta = dr.select(upward, 1.0 / params.eta_top, params.eta_top)
+        fresnel, cos_t = fresnel_dielectric(cos_m, eta)
+        reflects = at_bottom | (u_lobe < fresnel)
+        mirrored = reflect(w, m)
+        refracted = refract(w, m, cos_t, eta)
+        valid = dr.select(reflects, mirrored.z > 0, refracted.z < 0)
+        out = ops.select(reflects, mirrored, refracted)
+        tint = fresnel_conductor_rgb(cos_m, Color(*params.eta_bottom), Color(*params.k_bottom))
+        weight = ops.select(at_bottom, tint, Color.of(1.0)) * smith_g1(out, alpha, alpha)
+        weight = ops.select(valid, weight, Color.of(0.0))
+        # Back to the slab's frame: the side below the coat sees its normal pointing down.
+        out = Vec3(out.x, out.y, dr.select(upward, -out.z, out.z))
+
+        # In the medium, scatter isotropically.
+        out = ops.select(in_medium, _uniform_sphere(u1, u2), out)
+        weight = ops.select(in_medium, Color(*params.albedo), weight)
+        leaves = ~in_medium & (out.z > 0) & ~at_bottom & (reflects ^ walk.inside)
+        height = dr.select(in_medium, height, dr.select(at_bottom, 0.0, 1.0))
+
+        result = Color(*walk.throughput) * weight
+        survival, result = _roulette(result, leaves, rng)
+        return Walk(tuple(out), tuple(result), height, walk.inside | ~reflects, survival & ~leaves)
+
+
+def _uniform_sphere(u1: Float, u2: Float) -> Vec3:
+    z = 1.0 - 2.0 * u1
+    r = ops.safe_sqrt(1.0 - z * z)
+    phi = (2.0 * ops.PI) * u2
+    return Vec3(r * ops.cos(phi), r * ops.sin(phi), z)
+
+
+def _roulette(value: Color, exempt: Any, rng: Random) -> tuple[Any, Color]:
+    """Russian roulette on the brightest channel: (survives, value over the chance of survival)."""
+    chance = dr.select(exempt, 1.0, dr.minimum(ops.max_component(value) * (1.0 / ROULETTE_THRESHOLD), 1.0))
+    survives = rng.next_float32() < chance
+    return survives, ops.select(survives, value * (1.0 / dr.maximum(chance, 1e-20)), Color.of(0.0))

@@ -1,0 +1,250 @@
+"""BSDF tables with bins uniform in solid angle: accumulated from walks (paper eq. 9), saved, loaded, integrated.
+
+Isotropic tables have shape (n, theta_i, theta_o, phi, 3): bins uniform in cos(theta_i) and cos(theta_o), index 0 at
+grazing, and in the azimuth between wi and wo folded to [0, pi], mirror direction last. Anisotropic ones have shape
+(n, theta_i, phi_i, theta_o, phi_o, 3) with azimuths over [0, 2 pi). A value is the mean of f cos(theta_o) over its bin [1/sr].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from nma import ops
+from nma.errors import TableError
+from nma.ops import Vec3
+from nma.sources.base import Source, Walk
+
+# Throughputs are counted as integers in units of 2^-16: integer sums do not depend on the order of the additions.
+_UNIT = 65536.0
+# So many walks of one row fit one 32-bit bin, all of them with throughput 1.
+_WALKS_PER_ROW = 65535
+# Bins times walks of one launch: bounds the memory of a launch, not its result.
+_BINS_PER_LAUNCH = 1 << 25
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Resolution of a table. `phi_i == 0` means isotropic and folded."""
+
+    theta_i: int = 40
+    theta_o: int = 40
+    phi_o: int = 40
+    phi_i: int = 0
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one material's table, RGB last."""
+        rows = (self.theta_i, self.phi_i) if self.phi_i else (self.theta_i,)
+        return (*rows, self.theta_o, self.phi_o, 3)
+
+    @property
+    def rows(self) -> int:
+        """Number of bins of wi."""
+        return self.theta_i * max(self.phi_i, 1)
+
+    @property
+    def bins(self) -> int:
+        return self.rows * self.theta_o * self.phi_o
+
+    @property
+    def solid_angle(self) -> float:
+        """Solid angle of a bin of wo [sr]; a folded bin counts both of its mirror halves."""
+        return 2.0 * math.pi / (self.theta_o * self.phi_o)
+
+    def walks(self, wanted: int) -> int:
+        """`wanted` rounded up to the same number of walks in every row."""
+        return -(-wanted // self.rows) * self.rows
+
+
+ISOTROPIC = Grid()
+ANISOTROPIC = Grid(phi_o=80, phi_i=80)
+
+
+@dataclass
+class Tables:
+    """Tables of n materials, float32 `values` (n, *grid.shape), their standard `error` or None, and `walks` of each."""
+
+    params: NDArray[np.float64]
+    values: NDArray[np.floating]
+    walks: NDArray[np.int64]
+    error: NDArray[np.floating] | None = None
+
+    def albedo(self) -> NDArray[np.float64]:
+        """Directional albedo (n, theta_i[, phi_i], 3): 2 pi times the mean over the bins of wo."""
+        return 2.0 * math.pi * self.values.mean(axis=(-3, -2), dtype=np.float64)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the reference-file format of CONVENTIONS.md, atomically."""
+        path = Path(path)
+        partial = path.with_name(path.name + ".partial")
+        arrays = {"params": self.params, "table": self.values, "walks": self.walks}
+        if self.error is not None:
+            arrays["error"] = self.error
+        with partial.open("wb") as f:
+            np.savez_compressed(f, **arrays)
+        partial.replace(path)
+
+    @staticmethod
+    def load(path: str | Path) -> Tables:
+        """Reads a reference file; `TableError` says what is wrong with it."""
+        path = Path(path)
+        try:
+            with np.load(path) as f:
+                params, values, walks = f["params"], f["table"], f["walks"]
+                error = f["error"] if "error" in f else None
+        except FileNotFoundError:
+            raise TableError(f"{path}: no such file; `nma simulate` writes reference files") from None
+        except (KeyError, ValueError, OSError, EOFError) as e:
+            raise TableError(f"{path}: not a reference file (.npz with params, table and walks): {e}") from None
+        except Exception as e:  # zipfile and zlib raise their own kinds for damaged archives
+            raise TableError(f"{path}: damaged archive: {e}") from None
+        n = params.shape[0]
+        if params.ndim != 2 or values.ndim not in (5, 6) or values.shape[0] != n or values.shape[-1] != 3:
+            raise TableError(f"{path}: params {params.shape} and table {values.shape} do not belong together")
+        if error is not None and error.shape != values.shape:
+            raise TableError(f"{path}: error has shape {error.shape}, table has {values.shape}")
+        if not np.isfinite(values).all():
+            raise TableError(f"{path}: table of material {int(np.argwhere(~np.isfinite(values))[0][0])} is not finite")
+        return Tables(params, values, np.broadcast_to(walks, (n,)).astype(np.int64), error)
+
+
+def tabulate(
+    source: Source, params: NDArray[np.float64], walks: int, keys: NDArray[np.uint64], *, grid: Grid = ISOTROPIC, error: bool = True
+) -> Tables:
+    """Tables of `params` (n, columns) from at least `walks` walks each.
+
+    `keys` (n,) seed the materials' random streams: equal key, equal table, whatever else is in the call (`stream_keys`).
+    """
+    params = source.space.check(params)
+    total = grid.walks(walks)
+    sums = np.zeros((len(params), grid.bins, 3), np.float64)
+    squares = np.zeros_like(sums) if error else None
+    for launch in _launches(len(params), total // grid.rows, grid):
+        counts = _launch(source, params[launch.materials], keys[launch.materials], launch, grid, error)
+        sums[launch.materials] += counts[0]
+        if squares is not None:
+            squares[launch.materials] += counts[1]
+    per_row = total // grid.rows
+    values = sums / (per_row * grid.solid_angle)
+    shape = (len(params), *grid.shape)
+    standard_error = None
+    if squares is not None:
+        variance = np.maximum(squares - sums * sums / per_row, squares / per_row)
+        standard_error = (np.sqrt(variance) / (per_row * grid.solid_angle)).astype(np.float32).reshape(shape)
+    values = values.astype(np.float32).reshape(shape)
+    return Tables(params, values, np.full(len(params), total, np.int64), standard_error)
+
+
+def stream_keys(seed: int, indices: NDArray[np.integer] | range) -> NDArray[np.uint64]:
+    """Random-stream keys of materials: each depends on the seed and the material's own index alone."""
+    return np.array([np.random.SeedSequence((seed, int(i), 0x77A1)).generate_state(1, np.uint64)[0] for i in indices])
+
+
+@dataclass(frozen=True)
+class _Launch:
+    """One kernel launch: which materials, and which of the equal sweeps over all rows."""
+
+    materials: slice
+    first: int
+    sweeps: int
+
+
+def _launches(n: int, sweeps: int, grid: Grid) -> Iterator[_Launch]:
+    """Splits the work so that no bin overflows and a launch's tables fit in memory."""
+    group = max(1, _BINS_PER_LAUNCH // grid.bins)
+    for m in range(0, n, group):
+        for first in range(0, sweeps, _WALKS_PER_ROW):
+            yield _Launch(slice(m, min(m + group, n)), first, min(_WALKS_PER_ROW, sweeps - first))
+
+
+def _launch(source: Source, params: NDArray, keys: NDArray, launch: _Launch, grid: Grid, error: bool) -> NDArray:
+    """Sums of throughputs and of their squares (1 or 2, n, bins, 3) in units of throughput."""
+    Float, UInt32, UInt64 = dr.auto.Float, dr.auto.UInt32, dr.auto.UInt64
+    n = len(params)
+    thread = dr.arange(UInt32, n * launch.sweeps * max(grid.phi_i, 1))
+    material = thread // dr.opaque(UInt32, launch.sweeps * max(grid.phi_i, 1))
+    sweep = thread - material * dr.opaque(UInt32, launch.sweeps * max(grid.phi_i, 1))
+    columns = [dr.gather(Float, Float(np.ascontiguousarray(c, np.float32)), material) for c in params.T]
+    gathered = source.gather(columns)
+    key = dr.gather(UInt64, UInt64(keys), material)
+    # A sweep's stream is a function of its material's key and its own number.
+    number = UInt64(sweep) + dr.opaque(UInt64, launch.first * max(grid.phi_i, 1))
+    rng = dr.auto.PCG32(1, _mix(key ^ (number * 0x9E3779B97F4A7C15)), _mix(key + number))
+    counters = [dr.zeros(UInt32, n * grid.bins * 3) for _ in range(2 if error else 1)]
+    phi_row = sweep % grid.phi_i if grid.phi_i else UInt32(0)
+    _sweep(source, gathered, rng, material * grid.bins, phi_row, counters, grid)
+    dr.eval(*counters)
+    return np.stack([c.numpy().reshape(n, grid.bins, 3) for c in counters]) / _UNIT
+
+
+def _mix(x: Any) -> Any:
+    """Finaliser of MurmurHash3: neighbouring inputs, unrelated outputs."""
+    x = (x ^ (x >> 33)) * 0xFF51AFD7ED558CCD
+    x = (x ^ (x >> 33)) * 0xC4CEB9FE1A85EC53
+    return x ^ (x >> 33)
+
+
+@dataclass
+class _State:
+    """A lane's progress through its sweep: it starts its next walk as soon as one is over, so that no lane idles."""
+
+    rng: Any
+    row: Any
+    walk: Walk
+    phi: Any
+
+
+def _sweep(source: Source, params: Any, rng: Any, offset: Any, phi_row: Any, counters: list[Any], grid: Grid) -> None:
+    """One walk from every row of theta_i, in every lane, counted in the table at `offset`."""
+    UInt32 = dr.auto.UInt32
+
+    def begin(state: _State, fresh: Any) -> _State:
+        """Starts a walk in the lanes `fresh`, from a random wi in the bin of the current row."""
+        u_theta, u_phi = state.rng.next_float32(), state.rng.next_float32()
+        cos_theta = (dr.auto.Float(state.row) + u_theta) * (1.0 / grid.theta_i)
+        sin_theta = ops.safe_sqrt(1.0 - cos_theta * cos_theta)
+        phi = (dr.auto.Float(phi_row) + u_phi) * (2.0 * math.pi / grid.phi_i) if grid.phi_i else state.phi
+        wi = Vec3(sin_theta, sin_theta * 0.0, cos_theta)
+        if grid.phi_i:
+            wi = Vec3(sin_theta * dr.cos(phi), sin_theta * dr.sin(phi), cos_theta)
+        walk = dr.select(fresh, Walk.arriving_from(wi), state.walk)
+        return _State(state.rng, state.row, walk, dr.select(fresh, phi, state.phi))
+
+    def body(state: _State) -> tuple[_State]:
+        state = begin(state, ~state.walk.alive)
+        walk = source.step(params, state.walk, state.rng)
+        over = ~walk.alive
+        index = (offset + _bin(state.row, phi_row, Vec3(*walk.direction), grid)) * 3
+        for channel, value in enumerate(walk.throughput):
+            counted = over & (value > 0)
+            for counter, moment in zip(counters, (value, value * value), strict=False):
+                amount = UInt32(moment * _UNIT + 0.5)
+                dr.scatter_reduce(dr.ReduceOp.Add, counter, amount, index + channel, counted)
+        return (_State(state.rng, state.row + dr.select(over, UInt32(1), UInt32(0)), walk, state.phi),)
+
+    zero = dr.zeros(dr.auto.Float, dr.width(offset))
+    walk = Walk((zero, zero, zero), (zero, zero, zero), zero, zero > 1, zero > 1)
+    state = _State(rng, dr.zeros(UInt32, dr.width(offset)), walk, zero)
+    dr.while_loop((state,), lambda s: s.row < grid.theta_i, body, mode="symbolic", label="walks")
+
+
+def _bin(row: Any, phi_row: Any, wo: Vec3, grid: Grid) -> Any:
+    """Index of the bin of (row, wo) in a flattened table."""
+    UInt32 = dr.auto.UInt32
+    o = dr.minimum(UInt32(dr.maximum(wo.z, 0.0) * grid.theta_o), grid.theta_o - 1)
+    phi = ops.atan2(wo.y, wo.x)
+    if grid.phi_i:
+        turn = dr.select(phi < 0, phi + 2.0 * math.pi, phi) * (grid.phi_o / (2.0 * math.pi))
+        row = row * grid.phi_i + phi_row
+    else:
+        turn = dr.abs(phi) * (grid.phi_o / math.pi)
+    p = dr.minimum(UInt32(turn), grid.phi_o - 1)
+    return (row * grid.theta_o + o) * grid.phi_o + p
