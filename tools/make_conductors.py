@@ -2,9 +2,9 @@
 
     python tools/make_conductors.py [OUT.csv]
 
-Every spectrum in Mitsuba's `data/ior` goes through Mitsuba's own projection to linear sRGB (unbounded, as its `conductor`
-plugin does it). Transparent crystals (an absorption k near 0) and spectra whose projection had to clamp a negative channel
-are no metals for our purpose and are dropped.
+Every spectrum in Mitsuba's `data/ior` goes through Mitsuba's own projection to linear sRGB (unbounded, as its
+`conductor` plugin does it). Transparent crystals (an absorption k near 0) and spectra whose projection had to
+clamp a negative channel are no metals for our purpose and are dropped.
 """
 
 import argparse
@@ -20,9 +20,10 @@ HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
 # A conductor that absorbs less than this in any channel is a tinted dielectric; the next one above has .114.
 MIN_K = 0.1
 
-# Kept out of training to test unseen metals: an alkali, a refractory, a bright and a liquid metal, a gold-like nitride, one whose
-# eta rises towards blue, a weakly absorbing oxide, amorphous carbon. The corpus lists many substances twice (`Hg`, `Hg_palik`):
-# all rows of a substance go together, or the test would see training data.
+# Kept out of training to test unseen metals: an alkali, a refractory, a bright and a liquid metal, a
+# gold-like nitride, one whose eta rises towards blue, a weakly absorbing oxide, amorphous carbon. The corpus
+# holds many substances twice (`Hg`, `Hg_palik`): all rows of a substance go together, or the test would see
+# training data.
 HELD_OUT = ("Na", "W", "Rh", "Hg", "TiN", "Ta", "Cu2O", "a-C")
 
 
@@ -51,9 +52,8 @@ def main() -> None:
 
     kept = 0
     with out.open("w", newline="") as stream:
-        stream.write(
-            f"# Linear sRGB (eta, k) of Mitsuba {mi.__version__} data/ior; written by tools/make_conductors.py\n"
-        )
+        source = f"Mitsuba {mi.__version__} data/ior"
+        stream.write(f"# Linear sRGB (eta, k) of {source}; written by tools/make_conductors.py\n")
         rows = csv.writer(stream, lineterminator="\n")
         rows.writerow(HEADER)
         for name in names:

@@ -14,8 +14,8 @@ __all__ = ["Conductors", "load_conductors"]
 class Conductors:
     """Complex indices of refraction eta + i k of real conductors, as linear sRGB.
 
-    `names` has n entries; `eta` and `k` are (n, 3) float64, unitless, eta in .038 .. 7.51 and k in .114 .. 9.22; `held_out` is
-    (n,) bool, true for the metals that training never sees. Arrays are read-only.
+    `names` has n entries; `eta` (.038 .. 7.51) and `k` (.114 .. 9.22) are (n, 3) float64, unitless;
+    `held_out` is (n,) bool, true for the metals that training never sees. Arrays are read-only.
     """
 
     names: tuple[str, ...]
@@ -27,7 +27,7 @@ class Conductors:
         return len(self.names)
 
     def distinct(self) -> np.ndarray:
-        """Row numbers, ascending, of one row per different (eta, k): the corpus lists some substances twice."""
+        """Ascending numbers of one row per different (eta, k): the corpus holds some substances twice."""
         _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
         return np.sort(first)
 

@@ -1,0 +1,136 @@
+"""What this machine lacks to run the package, and the command that mends it."""
+
+import ctypes
+import importlib
+import os
+import re
+import sys
+import tempfile
+from dataclasses import dataclass
+from importlib import metadata
+
+from nma import llvm
+from nma.errors import MissingDependencyError
+from nma.llvm import ensure_llvm
+
+__all__ = ["Finding", "check", "ensure_llvm"]
+
+MIN_PYTHON = (3, 11)
+PACKAGE = "neural-material-adapter"
+SYSTEM_PACKAGES = {
+    "python": {
+        "debian": "sudo apt-get install python3.11 python3.11-venv",
+        "fedora": "sudo dnf install python3.11",
+        "arch": "sudo pacman -S python",
+        "macos": "brew install python@3.12",
+    },
+    "nvidia": {
+        "debian": "sudo apt-get install nvidia-driver (Ubuntu: sudo ubuntu-drivers install)",
+        "fedora": "sudo dnf install akmod-nvidia xorg-x11-drv-nvidia-cuda",
+        "arch": "sudo pacman -S nvidia-utils",
+        "macos": "not available on macOS; the CPU is used",
+    },
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at: whether it is `ok`, what was `found`, and the command that mends it ("" if ok).
+
+    What is `optional` only adds a feature; `found` says which.
+    """
+
+    name: str
+    ok: bool
+    found: str
+    fix: str = ""
+    optional: bool = False
+
+
+def check() -> list[Finding]:
+    """Looks at everything the package needs; starts no kernel and changes no setting but DRJIT_LIBLLVM_PATH.
+
+    The order is that of repair: a later finding may depend on an earlier one.
+    """
+    needed = ("drjit", "mitsuba", "numpy", "safetensors", "zarr", "matplotlib")
+    return [
+        _python(),
+        _llvm(),  # before the modules, as Dr.Jit looks for libLLVM when it is imported
+        *(_module(name) for name in needed),
+        _cuda(),
+        *(_module(name, "training") for name in ("jax", "optax")),
+        _module("flip_evaluator", "comparing images", "flip-evaluator"),
+        _module("skimage", "comparing images", "scikit-image"),
+        _working_directory(),
+    ]
+
+
+def _advice(what: str) -> str:
+    commands = SYSTEM_PACKAGES[what]
+    return commands.get(llvm.platform(), f"install it with your package manager ({what})")
+
+
+def _python() -> Finding:
+    wanted = ".".join(map(str, MIN_PYTHON))
+    found = f"{sys.version.split()[0]} at {sys.executable}"
+    if sys.version_info >= MIN_PYTHON:
+        return Finding("Python", True, found)
+    return Finding("Python", False, f"{found}, {wanted} or later is needed", _advice("python"))
+
+
+def _llvm() -> Finding:
+    try:
+        ensure_llvm()
+        path, version = llvm.find()
+    except MissingDependencyError as error:
+        fault, _, fix = str(error).rpartition("; ")
+        return Finding("libLLVM", False, fault, fix.removeprefix("run: "))
+    return Finding("libLLVM", True, f"{version} at {path}")
+
+
+def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
+    """Imports the module `name`, optional if it has a `purpose`; `distribution` is its name for pip."""
+    distribution = distribution or name
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        found = f"for {purpose}; not installed" if purpose else f"cannot be imported: {error}"
+        fix = f"{sys.executable} -m pip install '{_requirement(distribution)}'"
+        return Finding(name, False, found, fix, bool(purpose))
+    return Finding(name, True, metadata.version(distribution), optional=bool(purpose))
+
+
+def _requirement(distribution: str) -> str:
+    """The distribution with the versions that this package asks for, as in "mitsuba==3.9.*"."""
+    try:
+        wanted = metadata.requires(PACKAGE) or []
+    except metadata.PackageNotFoundError:
+        wanted = []
+    specifiers = (line.partition(";")[0].strip() for line in wanted)
+    return next((line for line in specifiers if re.split(r"[^\w.-]", line)[0] == distribution), distribution)
+
+
+def _cuda() -> Finding:
+    """Asks the driver for its devices, without creating a context on any."""
+    purpose = "for rendering and simulating on a GPU"
+    try:
+        driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
+    except OSError:
+        return Finding("CUDA", False, f"{purpose}; there is no NVIDIA driver", _advice("nvidia"), True)
+    count, version = ctypes.c_int(), ctypes.c_int()
+    if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
+        return Finding("CUDA", False, f"{purpose}; the NVIDIA driver sees no device", "nvidia-smi", True)
+    driver.cuDriverGetVersion(ctypes.byref(version))
+    major, minor = version.value // 1000, version.value % 1000 // 10
+    return Finding("CUDA", True, f"driver for CUDA {major}.{minor}, {count.value} device(s)", optional=True)
+
+
+def _working_directory() -> Finding:
+    folder = os.getcwd()
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return Finding(
+            "working directory", False, f"{folder}: {error.strerror}", f"chmod u+w '{folder}', or cd"
+        )
+    return Finding("working directory", True, f"{folder} can be written to")

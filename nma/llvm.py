@@ -1,0 +1,187 @@
+"""Finding a libLLVM that Dr.Jit can compile CPU kernels with.
+
+An old one does not fail, it kills the process while Dr.Jit compiles a kernel ("LLVM ERROR: Cannot select").
+So the package looks for the newest one on the system itself, and refuses old ones beforehand.
+
+Standard library only, and runnable as a file (`python3 -I nma/llvm.py`) before anything is installed.
+"""
+
+import ctypes
+import glob
+import os
+import re
+import shutil
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+# Dr.Jit 1.5 kills 14, 15 and 16 on machines with AVX-512 (`fmaximum`).
+MIN_VERSION = 17
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+NEED = f"Dr.Jit needs {MIN_VERSION} or later to compile for the CPU"
+
+# Where distributions put the library when the dynamic linker does not know of it.
+PATTERNS = (
+    "/usr/lib/*-linux-gnu/libLLVM*",
+    "/usr/lib/llvm*/lib*/libLLVM*",
+    "/usr/lib64/libLLVM*",
+    "/usr/lib64/llvm*/lib*/libLLVM*",
+    "/usr/lib/libLLVM*",
+    "/usr/local/lib*/libLLVM*",
+    "/opt/homebrew/opt/llvm*/lib/libLLVM*",
+    "/usr/local/opt/llvm*/lib/libLLVM*",
+    "/opt/local/libexec/llvm*/lib/libLLVM*",
+)
+
+# libLLVM-15.so.1, libLLVM.so.19.1, libLLVM-14.0.6.so, libLLVM.dylib; not libLLVM-C.so nor libLLVM-15-rust.so.
+_NAME = re.compile(r"libLLVM(-\d+[\d.]*)?\.(so|dylib)[\d.]*")
+_NUMBER = re.compile(r"(?:libLLVM-|libLLVM\.so\.|llvm[-@/]?)(\d+)")
+
+_INSTALL = {
+    "debian": "sudo apt-get install libllvm19",
+    "fedora": "sudo dnf install llvm-libs",
+    "arch": "sudo pacman -S llvm-libs",
+    "macos": "brew install llvm",
+}
+
+
+def platform() -> str:
+    """Whose package manager this system has: debian (also Ubuntu), fedora, arch, macos, or other."""
+    if sys.platform == "darwin":
+        return "macos"
+    try:
+        release = Path("/etc/os-release").read_text(encoding="utf-8")
+    except OSError:
+        return "other"
+    words = " ".join(re.findall(r"^ID(?:_LIKE)?=(.*)$", release, re.M)).replace('"', "").split()
+    aliases = {"debian": "debian", "ubuntu": "debian", "fedora": "fedora", "rhel": "fedora", "arch": "arch"}
+    return next((aliases[word] for word in words if word in aliases), "other")
+
+
+def install_command() -> str:
+    """What to type here to get a new enough libLLVM."""
+    return _INSTALL.get(platform(), f"install libLLVM {MIN_VERSION} or later and point {VARIABLE} to it")
+
+
+def version(path: str) -> int | None:
+    """Major version of the library at `path`, 0 if too old to tell (before 16), None if it does not load."""
+    try:
+        library = ctypes.CDLL(path)
+    except OSError:
+        return None
+    try:
+        ask = library.LLVMGetVersion
+    except AttributeError:
+        return 0 if hasattr(library, "LLVMGetGlobalContext") else None
+    major, minor, patch = (ctypes.c_uint() for _ in range(3))
+    ask(ctypes.byref(major), ctypes.byref(minor), ctypes.byref(patch))
+    return major.value
+
+
+def _version_of_name(path: str) -> int:
+    """Major version that the resolved file name or its folders state, 0 if they state none."""
+    numbers = _NUMBER.findall(os.path.realpath(path))
+    return int(numbers[-1]) if numbers else 0
+
+
+def _folders_of_user() -> list[str]:
+    """Folders that the environment adds to the search."""
+    variables = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH")
+    folders = [folder for name in variables for folder in os.environ.get(name, "").split(os.pathsep)]
+    prefix = os.environ.get("CONDA_PREFIX")
+    return [folder for folder in (*folders, f"{prefix}/lib" if prefix else "") if folder]
+
+
+def candidates() -> list[str]:
+    """Paths of this system's libLLVMs, one per file, newest first going by their names."""
+    patterns = (*PATTERNS, *(f"{folder}/libLLVM*" for folder in _folders_of_user()))
+    paths = [path for pattern in patterns for path in glob.glob(pattern)]
+    search = os.pathsep.join((os.environ.get("PATH", ""), "/sbin", "/usr/sbin"))
+    if ldconfig := shutil.which("ldconfig", path=search):
+        listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
+        paths += re.findall(r"=> (\S*libLLVM\S*)", listing)
+    files = {os.path.realpath(path): path for path in paths if _NAME.fullmatch(os.path.basename(path))}
+    return sorted(files.values(), key=lambda path: (_version_of_name(path), path), reverse=True)
+
+
+@cache
+def _examine(path: str) -> tuple[int | None, str]:
+    """Version of the library at `path`, and what is wrong with it ("" if nothing is)."""
+    found = version(path)
+    if found is None:
+        return None, f"{path} is no libLLVM that can be loaded"
+    if found < MIN_VERSION:
+        number = found or _version_of_name(path) or "older than 16"
+        return found, f"libLLVM {number} at {path} is too old, {NEED}"
+    return found, ""
+
+
+@cache
+def _newest() -> tuple[str, int, str]:
+    """Path and version of the newest library that loads, and what is wrong with it."""
+    for path in candidates():
+        found, fault = _examine(path)
+        if found is not None:
+            return path, found, fault
+    return "", 0, f"there is no libLLVM, {NEED}"
+
+
+def find() -> tuple[str, int]:
+    """Path and major version of the libLLVM to use: what DRJIT_LIBLLVM_PATH names, else the system's newest.
+
+    Raises `MissingDependencyError` with what to do, if there is none or it is too old.
+    """
+    if chosen := os.environ.get(VARIABLE):
+        found, fault = _examine(chosen)
+        if fault:
+            install = f" and run: {install_command()}" if _newest()[2] else ""
+            raise _missing(f"{VARIABLE}: {fault}; unset {VARIABLE}{install}")
+        return chosen, found or 0
+    path, newest, fault = _newest()
+    if fault:
+        raise _missing(f"{fault}; run: {install_command()}")
+    return path, newest
+
+
+def ensure_llvm() -> None:
+    """Makes sure that Dr.Jit compiles with a libLLVM it works with; to be called before the first CPU kernel.
+
+    Dr.Jit loads the library when it is first imported. Before that, this sets DRJIT_LIBLLVM_PATH unless the
+    user did; after that, it asks Dr.Jit what it loaded. Raises `MissingDependencyError` if that will not do.
+    """
+    if "drjit" in sys.modules:
+        _check_loaded()
+    else:
+        os.environ[VARIABLE], _ = find()
+
+
+def _check_loaded() -> None:
+    import drjit
+
+    major = drjit.detail.llvm_version()[0]  # -1 if it found no library
+    if major >= MIN_VERSION:
+        return
+    loaded = f"libLLVM {major}, which is too old ({NEED})" if major > 0 else "no libLLVM"
+    path, _, fault = _newest()
+    mend = f"run: {install_command()}" if fault else f"set {VARIABLE}={path} before Python starts"
+    raise _missing(f"Dr.Jit has loaded {loaded}; {mend}")
+
+
+def _missing(message: str) -> Exception:
+    # Not imported above, because this file must run before the package is installed.
+    from nma.errors import MissingDependencyError
+
+    return MissingDependencyError(message)
+
+
+def main() -> int:
+    """Prints the library in use, or what is wrong; exit status 0 or 1."""
+    chosen = os.environ.get(VARIABLE)
+    path, fault = (chosen, _examine(chosen)[1]) if chosen else (_newest()[0], _newest()[2])
+    print(fault or path)
+    return 1 if fault else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""The doctor, and the search for a libLLVM that Dr.Jit survives."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nma import doctor, llvm
+from nma.errors import MissingDependencyError
+
+# What a caller does before its first kernel, and a kernel that an old libLLVM dies of.
+FIRST_KERNEL = """
+from nma.errors import NmaError
+from nma.llvm import ensure_llvm
+try:
+    ensure_llvm()
+except NmaError as error:
+    print("refused:", error)
+else:
+    import drjit as dr
+    print("computed:", dr.maximum(dr.llvm.Float([1, 2]), 1.5))
+"""
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess:
+    """Runs Python `code` in a fresh process, as a process loads one libLLVM for ever."""
+    kept = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=kept | environment, capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.fixture
+def old_library(tmp_path: Path) -> str:
+    """A libLLVM from before 16, which cannot tell its version: one of the system's, or an imitation."""
+    for path in llvm.candidates():
+        if llvm._version_of_name(path) < 16:
+            return path
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no old libLLVM here, and no C compiler to imitate one")
+    source = tmp_path / "old.c"
+    source.write_text("void *LLVMGetGlobalContext(void) { return 0; }\n")
+    library = tmp_path / "libLLVM-14.so.1"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source], check=True)
+    return str(library)
+
+
+@pytest.mark.parametrize("prelude", ["", "import drjit\n"], ids=["before-drjit", "after-drjit"])
+def test_the_newest_library_is_used(prelude):
+    result = run(prelude + FIRST_KERNEL)
+    assert result.returncode == 0
+    assert result.stdout == "computed: [1.5, 2]\n"
+
+
+@pytest.mark.parametrize("prelude", ["", "import drjit\n"], ids=["before-drjit", "after-drjit"])
+def test_an_old_library_is_refused_instead_of_dying_in_the_compiler(prelude, old_library):
+    result = run(prelude + FIRST_KERNEL, DRJIT_LIBLLVM_PATH=old_library)
+    assert result.returncode == 0
+    assert result.stdout.startswith("refused: ")
+    assert result.stdout.count("\n") == 1
+    assert llvm.VARIABLE in result.stdout
+    if not prelude:
+        assert f"{old_library} is too old" in result.stdout
+
+
+@pytest.mark.parametrize("prelude", ["", "import drjit\n"], ids=["before-drjit", "after-drjit"])
+@pytest.mark.parametrize("missing", ["/nowhere/libLLVM.so", __file__], ids=["no-file", "no-library"])
+def test_a_missing_library_is_refused(prelude, missing):
+    result = run(prelude + FIRST_KERNEL, DRJIT_LIBLLVM_PATH=missing)
+    assert result.returncode == 0
+    assert result.stdout.startswith("refused: ")
+    assert result.stdout.count("\n") == 1
+
+
+@pytest.fixture
+def _fresh_search(monkeypatch):
+    """Forgets what earlier searches found, before and after."""
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    for cached in (llvm._newest, llvm._examine):
+        cached.cache_clear()
+    yield
+    for cached in (llvm._newest, llvm._examine):
+        cached.cache_clear()
+
+
+@pytest.mark.usefixtures("_fresh_search")
+@pytest.mark.parametrize(
+    ("system", "command"),
+    [("debian", "apt-get"), ("fedora", "dnf"), ("arch", "pacman"), ("macos", "brew"), ("other", "install")],
+)
+def test_a_system_without_libllvm_is_told_what_to_install(monkeypatch, system, command):
+    monkeypatch.setattr(llvm, "candidates", list)
+    monkeypatch.setattr(llvm, "platform", lambda: system)
+    with pytest.raises(MissingDependencyError, match=f"there is no libLLVM.*{command}"):
+        llvm.find()
+
+
+@pytest.mark.usefixtures("_fresh_search")
+def test_the_newest_of_several_wins_and_what_does_not_load_is_passed_over(monkeypatch):
+    versions = {"libLLVM-21.so": None, "libLLVM-20.so": 20, "libLLVM-14.so": 0}
+    monkeypatch.setattr(llvm, "candidates", lambda: list(versions))
+    monkeypatch.setattr(llvm, "version", versions.get)
+    assert llvm.find() == ("libLLVM-20.so", 20)
+    monkeypatch.setenv(llvm.VARIABLE, "libLLVM-14.so")
+    with pytest.raises(MissingDependencyError, match="libLLVM 14 at .* is too old.*; unset"):
+        llvm.find()
+
+
+def test_libraries_are_ordered_by_number(tmp_path, monkeypatch):
+    names = ["libLLVM-9.so.1", "libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM-15-rust-1.7.so", "libLLVM-C.so"]
+    for name in names:
+        (tmp_path / name).touch()
+    monkeypatch.setattr(llvm, "PATTERNS", ())
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
+    monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
+    monkeypatch.delenv("CONDA_PREFIX", raising=False)
+    found = [Path(path).name for path in llvm.candidates()]
+    assert found == ["libLLVM.so.19.1", "libLLVM-14.so.1", "libLLVM-9.so.1"]
+
+
+def test_findings_name_a_command_where_something_is_wrong():
+    findings = doctor.check()
+    assert {"Python", "libLLVM", "drjit", "mitsuba", "CUDA", "jax", "working directory"} <= {
+        finding.name for finding in findings
+    }
+    for finding in findings:
+        assert finding.found
+        assert bool(finding.fix) != finding.ok
+
+
+def test_a_missing_module_is_found_with_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jax", None)
+    finding = next(finding for finding in doctor.check() if finding.name == "jax")
+    assert not finding.ok
+    assert finding.optional
+    assert "training" in finding.found
+    assert "pip install 'jax" in finding.fix
+
+
+def test_importing_the_package_loads_neither_mitsuba_nor_drjit():
+    result = run("import sys, nma, nma.doctor; print({'mitsuba', 'drjit', 'jax'} & set(sys.modules))")
+    assert result.stdout == "set()\n"
