@@ -1,0 +1,33 @@
+# make demo    one picture of the whole path: out/demo.png
+# make test    lint and tests
+# make types   the type checker
+# make wheel   dist/*.whl
+# make lock    write requirements.lock anew from the newest versions
+# All of them set up .venv first; see tools/setup.sh.
+BIN := .venv/bin
+WORKERS ?= 2
+
+.PHONY: demo test types wheel lock
+demo:
+	@tools/setup.sh demo
+	$(BIN)/nma demo
+
+test:
+	@tools/setup.sh test
+	$(BIN)/ruff check --quiet .
+	$(BIN)/ruff format --quiet --check .
+	$(BIN)/python -m pytest --quiet --numprocesses $(WORKERS) $(ARGS)
+
+types:
+	@tools/setup.sh test
+	$(BIN)/mypy
+
+wheel:
+	@tools/setup.sh test
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+lock:
+	rm -rf build/lock && python3 -m venv build/lock
+	build/lock/bin/pip install --quiet --editable '.[dev]'
+	(head -n 1 requirements.lock; build/lock/bin/pip freeze --exclude-editable) > build/requirements.lock
+	mv build/requirements.lock requirements.lock
