@@ -1,7 +1,8 @@
 """Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written once (CONVENTIONS.md).
 
-Each function looks at its arguments and calls the library they belong to; plain Python numbers go to NumPy. Code built on
-this module never branches on values: it uses `select`. `Vec3` is a triple of such arrays, a direction or an RGB colour.
+Each function looks at its arguments and calls the library they belong to; plain Python numbers give plain Python numbers.
+Code built on this module never branches on values: it uses `select`. `Vec3` is a triple of such arrays, a direction or
+an RGB colour.
 """
 
 from __future__ import annotations
@@ -18,15 +19,29 @@ PI = math.pi
 INV_PI = 1.0 / math.pi
 
 
+class _Python:
+    """NumPy's operations on plain Python numbers, without its scalar types: those capture other libraries' arrays."""
+
+    __name__ = "python"
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(np, name)
+        return lambda *args: function(*args).item()
+
+
+_PYTHON = _Python()
+
+
 def _library(*args: Any) -> str:
-    """Name of the array library that owns the arguments: "drjit", "jax" or "numpy"."""
+    """Name of the array library that owns the arguments: "drjit", "jax", "numpy" or "python" for plain numbers."""
     for a in args:
         module = type(a).__module__
         if module.startswith(("drjit", "mitsuba")):
             return "drjit"
         if module.startswith("jax"):
             return "jax"
-    return "numpy"
+    plain = all(type(a) in (float, int, bool) for a in args)
+    return "python" if plain else "numpy"
 
 
 def _module(*args: Any) -> Any:
@@ -40,7 +55,7 @@ def _module(*args: Any) -> Any:
         import jax.numpy
 
         return jax.numpy
-    return np
+    return _PYTHON if library == "python" else np
 
 
 def sqrt(x: Float) -> Float:
@@ -64,6 +79,15 @@ def log(x: Float) -> Float:
 def log1p(x: Float) -> Float:
     m = _module(x)
     return m.log(1.0 + x) if m.__name__ == "drjit" else m.log1p(x)
+
+
+def sigmoid(x: Float) -> Float:
+    """1 / (1 + exp(-x)), as a tangent so that neither value nor derivative overflows."""
+    return 0.5 + 0.5 * tanh(0.5 * x)
+
+
+def tanh(x: Float) -> Float:
+    return _module(x).tanh(x)
 
 
 def sin(x: Float) -> Float:
@@ -170,8 +194,11 @@ class Vec3(NamedTuple):
     def __neg__(self):
         return Vec3(-self.x, -self.y, -self.z)
 
-    __radd__ = __add__
-    __rmul__ = __mul__
+    def __radd__(self, other):
+        return self + other
+
+    def __rmul__(self, other):
+        return self * other
 
     def __rsub__(self, other):
         return Vec3.of(other) - self

@@ -1,0 +1,172 @@
+"""From the raw outputs of a network to a blend, and from a blend to plain numbers and back.
+
+Layout everywhere: the parameters of instance 1, of instance 2, ..., then the blends. The ranges are data: weights files
+carry them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from nma import ops
+from nma.errors import WeightsError
+from nma.ops import Color, Float
+from nma.target.blend import Blend
+from nma.target.principled import MIN_ALPHA, Principled
+
+Scale = Literal["linear", "log"]
+ENCODE_MARGIN = (
+    1e-6  # fraction of a range that `encode` keeps away from its ends, where no finite output leads
+)
+
+
+@dataclass(frozen=True)
+class TargetParam:
+    """A field of `Principled` that the network sets: its size and the range its raw outputs are decoded to."""
+
+    name: str
+    size: int = 1
+    low: float = 0.0
+    high: float = 1.0
+    scale: Scale = "linear"
+
+    def decode(self, raw: Float) -> Float:
+        """Any real number to the range: its sigmoid, spread linearly or by powers."""
+        unit = ops.sigmoid(raw)
+        if self.scale == "log":
+            return self.low * ops.exp(math.log(self.high / self.low) * unit)
+        return self.low + (self.high - self.low) * unit
+
+    def encode(self, value: Float) -> Float:
+        """Inverse of `decode`, clipped away from the ends of the range."""
+        if self.scale == "log":
+            value = ops.maximum(value, self.low)
+            return logit(ops.log(value * (1.0 / self.low)) * (1.0 / math.log(self.high / self.low)))
+        return logit((value - self.low) * (1.0 / (self.high - self.low)))
+
+
+# The paper's 11 numbers. `specular` reaches an index of refraction of 2.1, Burley's ends at 1.8. The floor of alpha
+# bounds the roughness.
+PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
+    TargetParam("base_color", size=3),
+    TargetParam("roughness", low=math.sqrt(MIN_ALPHA), scale="log"),
+    TargetParam("metallic"),
+    TargetParam("specular", high=1.6),
+    TargetParam("spec_tint"),
+    TargetParam("sheen"),
+    TargetParam("sheen_tint"),
+    TargetParam("clearcoat"),
+    TargetParam("clearcoat_gloss"),
+)
+
+
+def params_to_json(params: Sequence[TargetParam]) -> list[dict[str, Any]]:
+    """The declaration as plain data for a weights file."""
+    return [asdict(p) for p in params]
+
+
+def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
+    """Inverse of `params_to_json`. Raises `WeightsError` where a declaration makes no sense for this version."""
+    try:
+        params = tuple(TargetParam(**entry) for entry in data)
+    except TypeError as e:
+        raise WeightsError(
+            f"Target parameters are malformed ({e}); the file needs another version of nma."
+        ) from e
+    for p in params:
+        size = 3 if p.name == "base_color" else 1
+        ranged = p.low < p.high and (p.scale == "linear" or (p.scale == "log" and p.low > 0))
+        if p.name not in Principled._fields or p.size != size or not ranged:
+            raise WeightsError(f"Target parameter {p} is not one of {Principled._fields} with a valid range.")
+    return params
+
+
+def instance_size(params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
+    """Numbers per instance: 11 for the paper's parameters."""
+    return sum(p.size for p in params)
+
+
+def output_size(n_instances: int, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
+    """Numbers that describe a blend: all instances' and n - 1 blends; 23 for the paper's two instances."""
+    return n_instances * instance_size(params) + n_instances - 1
+
+
+def logit(unit: Float) -> Float:
+    """Inverse of the sigmoid, clipped to finite values."""
+    u = ops.clip(unit, ENCODE_MARGIN, 1.0 - ENCODE_MARGIN)
+    return ops.log(u / (1.0 - u))
+
+
+def decode(
+    raw: Sequence[Float], n_instances: int, params: Sequence[TargetParam] = PRINCIPLED_PARAMS
+) -> Blend:
+    """Raw network outputs, `output_size` of them, to a blend. Weights come from breaking a stick: each blend takes its
+    share of what the instances before it left."""
+    size = instance_size(params)
+    instances = tuple(
+        _instance(_decoded(raw[k * size : (k + 1) * size], params), params) for k in range(n_instances)
+    )
+    left: Float = 1.0
+    weights = []
+    for x in raw[n_instances * size : output_size(n_instances, params)]:
+        share = ops.sigmoid(x)
+        weights.append(left * share)
+        left = left * (1.0 - share)
+    return Blend(instances, (*weights, left))
+
+
+def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
+    """Raw outputs that `decode` turns into (nearly) this blend: a starting point for a fit."""
+    raw: list[Float] = []
+    for p in blend.instances:
+        for param in params:
+            value = getattr(p, param.name)
+            raw += [param.encode(v) for v in (value if param.size > 1 else (value,))]
+    left: Float = 1.0
+    for weight in blend.weights[:-1]:
+        raw.append(logit(weight / ops.maximum(left, ENCODE_MARGIN)))
+        left = left - weight
+    return raw
+
+
+def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
+    """The blend as plain numbers: parameters, then all weights but the last. Curves over cos(theta_i) interpolate them:
+    any convex combination of such lists describes a valid blend again.
+    """
+    flat: list[Float] = []
+    for p in blend.instances:
+        for param in params:
+            value = getattr(p, param.name)
+            flat += list(value) if param.size > 1 else [value]
+    return flat + list(blend.weights[:-1])
+
+
+def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> Blend:
+    """Inverse of `numbers`; the number of instances follows from the length."""
+    size = instance_size(params)
+    n = (len(flat) + 1) // (size + 1)
+    if n < 1 or len(flat) != output_size(n, params):
+        raise WeightsError(
+            f"{len(flat)} numbers describe no blend: one needs {size} per instance and one per blend."
+        )
+    instances = tuple(_instance(flat[k * size : (k + 1) * size], params) for k in range(n))
+    weights = tuple(flat[n * size :])
+    return Blend(instances, (*weights, 1.0 - sum(weights)))
+
+
+def _decoded(raw: Sequence[Float], params: Sequence[TargetParam]) -> list[Float]:
+    ranges = [p for p in params for _ in range(p.size)]
+    return [p.decode(x) for p, x in zip(ranges, raw, strict=True)]
+
+
+def _instance(values: Sequence[Float], params: Sequence[TargetParam]) -> Principled:
+    """An instance from its numbers; parameters that are not declared are off."""
+    fields: dict[str, Any] = dict.fromkeys(Principled._fields, 0.0)
+    first = 0
+    for p in params:
+        fields[p.name] = Color(*values[first : first + 3]) if p.size == 3 else values[first]
+        first += p.size
+    return Principled(**fields)

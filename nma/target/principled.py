@@ -1,0 +1,201 @@
+"""One Principled BRDF: evaluation, sampling and density (Burley 2012 and 2015), written once for every language.
+
+Dialect "mitsuba-principled-reflection": the reflection side (spec_trans = 0) of Mitsuba 3.9's `principled`. Directions
+follow CONVENTIONS.md: local frame, z up, `wi` towards the viewer, `wo` towards the light, values are f cos(theta_o).
+
+Deliberate differences from Mitsuba's plugin, all of them small:
+- Peaks of narrow lobes keep their digits: GGX and GTR1 are written with the components of the half vector, never with
+  1 + (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is off by several per cent at alpha .001.
+- `specular` may vary like every other number, and 0 means no dielectric reflection (Mitsuba replaces 0 by .001).
+- Tints divide by max(luminance, 1e-6), so they fade for colours darker than that instead of switching to white at zero.
+- Directions within 1e-9 of the horizon are invalid, as are those below it (no back side).
+- Lobes are chosen by their estimated albedo, and one density covers the whole blend (`nma.target.blend`).
+
+The functions here use straight-line arithmetic and `select` only: exporters print them in other languages.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from nma import ops
+from nma.ops import Color, Float, Mask, Vec3
+
+DIALECT = "mitsuba-principled-reflection"
+MIN_ALPHA = 0.001  # Mitsuba's floor of the microfacet width
+MIN_COS = 1e-9  # directions closer to the horizon are invalid
+CLEARCOAT_MASKING_ALPHA = 0.25  # Burley 2012, section 5.6
+CLEARCOAT_F0 = 0.04
+
+
+class Principled(NamedTuple):
+    """Parameters of one Principled BRDF, in [0, 1] each (`specular` up to 1.8); nine fields hold the paper's 11 numbers.
+
+    `anisotropic` stretches the specular lobe along x; `flatness` blends towards the fake subsurface of Burley 2015.
+    """
+
+    base_color: Color
+    roughness: Float
+    metallic: Float
+    specular: Float
+    spec_tint: Float
+    sheen: Float
+    sheen_tint: Float
+    clearcoat: Float
+    clearcoat_gloss: Float
+    anisotropic: Float = 0.0
+    flatness: Float = 0.0
+
+
+class Geometry(NamedTuple):
+    """What every lobe of every instance needs to know about one pair of directions."""
+
+    valid: Mask  # both directions above the horizon
+    wi: Vec3
+    wo: Vec3
+    h: Vec3  # wi + wo, not normalised
+    h2: Float  # its squared length
+    cos_d: Float  # cosine between either direction and the half vector
+    weight_i: Float  # Schlick weights of the three cosines
+    weight_o: Float
+    weight_d: Float
+    clearcoat: Float  # clearcoat lobe but for its strength and its distribution of normals
+
+
+def schlick_weight(cos: Float) -> Float:
+    """(1 - cos)^5. Schlick 1994, eq. 15."""
+    m = ops.clip(1.0 - cos, 0.0, 1.0)
+    m2 = m * m
+    return m2 * m2 * m
+
+
+def masking_denominator(v: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
+    """2 cos / G1(v) for v.z >= 0: Smith masking without a division by the cosine. Heitz 2014, eq. 72 and 86."""
+    sx = alpha_x * v.x
+    sy = alpha_y * v.y
+    return v.z + ops.sqrt(v.z * v.z + sx * sx + sy * sy)
+
+
+def geometry(wi: Vec3, wo: Vec3) -> Geometry:
+    """Half vector, Schlick weights and the shared part of the clearcoat for unit directions `wi` and `wo`."""
+    valid = (wi.z > MIN_COS) & (wo.z > MIN_COS)
+    # Invalid pairs continue with harmless cosines, so that neither values nor derivatives are ever infinite.
+    i = Vec3(wi.x, wi.y, ops.select(valid, wi.z, 1.0))
+    o = Vec3(wo.x, wo.y, ops.select(valid, wo.z, 1.0))
+    h = i + o
+    h2 = ops.dot(h, h)
+    cos_d = ops.minimum(0.5 * ops.sqrt(h2), 1.0)
+    weight_d = schlick_weight(cos_d)
+    fresnel = CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * weight_d
+    masking_i = 2.0 * i.z / masking_denominator(i, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
+    masking_o = 2.0 * o.z / masking_denominator(o, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
+    clearcoat = 0.25 * fresnel * masking_i * masking_o * o.z
+    return Geometry(valid, i, o, h, h2, cos_d, schlick_weight(i.z), schlick_weight(o.z), weight_d, clearcoat)
+
+
+def spec_alpha(roughness: Float, anisotropic: Float) -> tuple[Float, Float]:
+    """Microfacet widths of the specular lobe along x and y. Burley 2012, section 5.4."""
+    alpha = roughness * roughness
+    aspect = ops.sqrt(1.0 - 0.9 * anisotropic)
+    return ops.maximum(alpha / aspect, MIN_ALPHA), ops.maximum(alpha * aspect, MIN_ALPHA)
+
+
+def clearcoat_alpha(clearcoat_gloss: Float) -> Float:
+    """Width of the clearcoat's GTR1 lobe, .1 to .001. Burley 2012, section 5.6."""
+    return ops.lerp(0.1, 0.001, clearcoat_gloss)
+
+
+def specular_f0(specular: Float) -> Float:
+    """Dielectric reflectance at normal incidence. Burley 2012, section 5.5."""
+    return 0.08 * specular
+
+
+def specular_eta(specular: Float) -> Float:
+    """Index of refraction whose reflectance at normal incidence is `specular_f0`."""
+    return 2.0 / (1.0 - ops.safe_sqrt(specular_f0(specular))) - 1.0
+
+
+def dielectric_reflectance(cos: Float, eta: Float) -> Float:
+    """Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Cook and Torrance 1982, section 4."""
+    eta2 = eta * eta
+    g = ops.sqrt(ops.maximum(eta2 - 1.0 + cos * cos, 1e-12))
+    r_s = (cos - g) / (cos + g)
+    r_p = (eta2 * cos - g) / (eta2 * cos + g)
+    return 0.5 * (r_s * r_s + r_p * r_p)
+
+
+def tint_color(base_color: Color) -> Color:
+    """Hue and saturation of a colour: the colour divided by its luminance. Burley 2012, section 5.3."""
+    return base_color * (1.0 / ops.maximum(ops.luminance(base_color), 1e-6))
+
+
+def spec_reflectance(p: Principled, cos: Float, weight: Float) -> Color:
+    """Fresnel term of the specular lobe: metal, tinted and plain dielectric. `weight` is `schlick_weight(cos)`."""
+    dielectric = (
+        (1.0 - p.metallic) * (1.0 - p.spec_tint) * dielectric_reflectance(cos, specular_eta(p.specular))
+    )
+    tinted = (1.0 - p.metallic) * p.spec_tint
+    # Schlick's F0 + (1 - F0) weight for both coloured terms, collected.
+    f0 = p.base_color * p.metallic + tint_color(p.base_color) * (tinted * specular_f0(p.specular))
+    return f0 * (1.0 - weight) + (dielectric + (p.metallic + tinted) * weight)
+
+
+def ggx(h: Vec3, h2: Float, alpha_x: Float, alpha_y: Float) -> Float:
+    """GGX distribution of normals for an unnormalised half vector [1/sr]. Burley 2012, eq. 13."""
+    sx = h.x / alpha_x
+    sy = h.y / alpha_y
+    r = h2 / (sx * sx + sy * sy + h.z * h.z)
+    return r * r / (ops.PI * alpha_x * alpha_y)
+
+
+def gtr1_norm(alpha2: Float) -> Float:
+    """Factor that makes the projected GTR1 distribution integrate to one. Burley 2012, eq. 4."""
+    return (1.0 - alpha2) / (-ops.PI * ops.log(alpha2))
+
+
+def gtr1_slope(h: Vec3, alpha2: Float) -> Float:
+    """1 + (alpha^2 - 1) cos^2 times the squared length of `h`, without cancellation."""
+    return h.x * h.x + h.y * h.y + alpha2 * h.z * h.z
+
+
+def eval_diffuse(p: Principled, g: Geometry) -> Color:
+    """Diffuse reflection, retro-reflection, fake subsurface and sheen, f cos(theta_o). Burley 2012, 2015 section 3."""
+    retro = 2.0 * p.roughness * g.cos_d * g.cos_d
+    lambert = (1.0 - 0.5 * g.weight_i) * (1.0 - 0.5 * g.weight_o)
+    rough = lambert + retro * (g.weight_o + g.weight_i + g.weight_o * g.weight_i * (retro - 1.0))
+    flat_90 = 0.5 * retro - 1.0
+    flat_f = (1.0 + flat_90 * g.weight_o) * (1.0 + flat_90 * g.weight_i)
+    flat = 1.25 * (flat_f * (1.0 / (g.wi.z + g.wo.z) - 0.5) + 0.5)
+    # Metals have neither a diffuse base nor a sheen.
+    nonmetal = (1.0 - p.metallic) * g.wo.z
+    sheen = nonmetal * p.sheen * g.weight_d
+    tinted = tint_color(p.base_color) * (sheen * p.sheen_tint) + sheen * (1.0 - p.sheen_tint)
+    return p.base_color * (nonmetal * ops.INV_PI * ops.lerp(rough, flat, p.flatness)) + tinted
+
+
+def eval_spec(p: Principled, g: Geometry) -> Color:
+    """Microfacet reflection of metal and dielectric, f cos(theta_o). Walter 2007, eq. 20, separable masking."""
+    alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
+    # D G1(wi) G1(wo) / (4 cos_i), with both maskings written as cosines over their denominators.
+    masked = g.wo.z / (
+        masking_denominator(g.wi, alpha_x, alpha_y) * masking_denominator(g.wo, alpha_x, alpha_y)
+    )
+    return spec_reflectance(p, g.cos_d, g.weight_d) * (ggx(g.h, g.h2, alpha_x, alpha_y) * masked)
+
+
+def eval_clearcoat(p: Principled, g: Geometry) -> Float:
+    """White clearcoat, f cos(theta_o). Burley 2012, section 5.6, with Mitsuba's masking (no 1 / (4 cos_i cos_o))."""
+    alpha = clearcoat_alpha(p.clearcoat_gloss)
+    alpha2 = alpha * alpha
+    return p.clearcoat * g.clearcoat * gtr1_norm(alpha2) * g.h2 / gtr1_slope(g.h, alpha2)
+
+
+def eval_geometry(p: Principled, g: Geometry) -> Color:
+    """All lobes of one instance, f cos(theta_o) [1/sr], for a pair of directions that `geometry` prepared."""
+    return eval_diffuse(p, g) + eval_spec(p, g) + eval_clearcoat(p, g)
+
+
+def eval_principled(p: Principled, wi: Vec3, wo: Vec3) -> Color:
+    """f cos(theta_o) [1/sr] of one instance, zero below the horizon. `wi` and `wo` are unit vectors."""
+    g = geometry(wi, wo)
+    return ops.select(g.valid, eval_geometry(p, g), 0.0)
