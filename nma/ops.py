@@ -1,8 +1,8 @@
 """Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written once (CONVENTIONS.md).
 
-Each function looks at its arguments and calls the library they belong to; plain Python numbers give plain Python numbers.
-Code built on this module never branches on values: it uses `select`. `Vec3` is a triple of such arrays, a direction or
-an RGB colour.
+Each function looks at its arguments and calls the library they belong to; plain Python numbers give plain Python
+numbers. Code built on this module never branches on values: it uses `select`. `Vec3` is a triple of such arrays, a
+direction or an RGB colour.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _Python:
 _PYTHON = _Python()
 
 
-def _library(*args: Any) -> str:
+def library(*args: Any) -> str:
     """Name of the array library that owns the arguments: "drjit", "jax", "numpy" or "python" for plain numbers."""
     for a in args:
         module = type(a).__module__
@@ -46,16 +46,16 @@ def _library(*args: Any) -> str:
 
 def _module(*args: Any) -> Any:
     """The array library itself, imported only when an argument of its own shows that it is in use."""
-    library = _library(*args)
-    if library == "drjit":
+    owner = library(*args)
+    if owner == "drjit":
         import drjit
 
         return drjit
-    if library == "jax":
+    if owner == "jax":
         import jax.numpy
 
         return jax.numpy
-    return _PYTHON if library == "python" else np
+    return _PYTHON if owner == "python" else np
 
 
 def sqrt(x: Float) -> Float:
@@ -147,12 +147,12 @@ def copysign(magnitude: Float, sign: Float) -> Float:
 
 def detach(x: Float) -> Float:
     """The value without its derivative."""
-    library = _library(x)
-    if library == "drjit":
+    owner = library(x)
+    if owner == "drjit":
         import drjit
 
         return drjit.detach(x)
-    if library == "jax":
+    if owner == "jax":
         import jax
 
         return jax.lax.stop_gradient(x)
@@ -221,6 +221,11 @@ def normalize(v: Vec3) -> Vec3:
 
 def max_component(c: Vec3) -> Float:
     return maximum(maximum(c.x, c.y), c.z)
+
+
+def mean(c: Vec3) -> Float:
+    """Mean of the three components."""
+    return (c.x + c.y + c.z) * (1.0 / 3.0)
 
 
 def luminance(c: Vec3) -> Float:

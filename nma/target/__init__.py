@@ -1,6 +1,6 @@
 """The analytic BRDF that adapters drive: a blend of Principled BRDFs, written once for every array library."""
 
-from nma.target.blend import Blend, eval, lobe_alphas
+from nma.target.blend import Blend, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.decode import (
     PRINCIPLED_PARAMS,
     TargetParam,
@@ -20,9 +20,12 @@ __all__ = [
     "decode",
     "encode",
     "eval",
+    "eval_pdf",
     "eval_principled",
     "from_numbers",
     "lobe_alphas",
     "numbers",
     "output_size",
+    "pdf",
+    "sample",
 ]

@@ -1,4 +1,4 @@
-"""Blend of Principled BRDFs: the target of every adapter (CONVENTIONS.md)."""
+"""Blend of Principled BRDFs, the target of every adapter: one evaluation, one density and one sample over all lobes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from typing import NamedTuple
 from nma import ops
 from nma.ops import Color, Float, Vec3
 from nma.target.principled import (
+    MIN_COS,
     Principled,
     clearcoat_alpha,
-    eval_geometry,
+    eval_pdf_lobes,
     geometry,
     spec_alpha,
 )
+from nma.target.sampling import Albedos, lobe_albedos, sample_clearcoat, sample_diffuse, sample_spec
 
 
 class Blend(NamedTuple):
@@ -22,13 +24,71 @@ class Blend(NamedTuple):
     weights: tuple[Float, ...]
 
 
+def eval_pdf(blend: Blend, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
+    """f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both zero below the horizon. Unit directions."""
+    g = geometry(wi, wo)
+    value = Color(0.0, 0.0, 0.0)
+    pdf: Float = 0.0
+    for p, weight, odds in zip(blend.instances, blend.weights, lobe_probabilities(blend, g.wi), strict=True):
+        lobes = eval_pdf_lobes(p, g)
+        value = value + lobes.value * weight
+        pdf = pdf + (
+            odds.diffuse * lobes.diffuse_pdf
+            + odds.spec * lobes.spec_pdf
+            + odds.clearcoat * lobes.clearcoat_pdf
+        )
+    return ops.select(g.valid, value, 0.0), ops.select(g.valid, pdf, 0.0)
+
+
 def eval(blend: Blend, wi: Vec3, wo: Vec3) -> Color:
     """f cos(theta_o) [1/sr] of the blend, zero below the horizon. `wi` and `wo` are unit vectors."""
     g = geometry(wi, wo)
     value = Color(0.0, 0.0, 0.0)
     for p, weight in zip(blend.instances, blend.weights, strict=True):
-        value = value + eval_geometry(p, g) * weight
+        value = value + eval_pdf_lobes(p, g).value * weight
     return ops.select(g.valid, value, 0.0)
+
+
+def pdf(blend: Blend, wi: Vec3, wo: Vec3) -> Float:
+    """Density of `sample` per solid angle of `wo` [1/sr]."""
+    return eval_pdf(blend, wi, wo)[1]
+
+
+def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
+    """Direction `wo` from three uniform numbers in [0, 1), with `eval_pdf` of it; pdf == 0 marks an invalid sample."""
+    view = Vec3(wi.x, wi.y, ops.select(wi.z > MIN_COS, wi.z, 1.0))
+    odds = lobe_probabilities(blend, view)
+    # All diffuse lobes come first, then all specular ones, then the clearcoats.
+    spec_start = sum(o.diffuse for o in odds)
+    clearcoat_start = spec_start + sum(o.spec for o in odds)
+    (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)
+    spec_end = spec_start
+    clearcoat_end = clearcoat_start
+    # The widths of an instance hold from where the lobes of the instances before it end.
+    for o, (next_x, next_y, next_c) in zip(odds, others, strict=False):
+        spec_end = spec_end + o.spec
+        clearcoat_end = clearcoat_end + o.clearcoat
+        alpha_x = ops.select(u_lobe >= spec_end, next_x, alpha_x)
+        alpha_y = ops.select(u_lobe >= spec_end, next_y, alpha_y)
+        alpha_c = ops.select(u_lobe >= clearcoat_end, next_c, alpha_c)
+    spec = ops.select(
+        u_lobe < clearcoat_start,
+        sample_spec(view, alpha_x, alpha_y, u1, u2),
+        sample_clearcoat(view, alpha_c, u1, u2),
+    )
+    wo = ops.select(u_lobe < spec_start, sample_diffuse(u1, u2), spec)
+    value, density = eval_pdf(blend, wi, wo)
+    return wo, value, density
+
+
+def lobe_probabilities(blend: Blend, wi: Vec3) -> tuple[Albedos, ...]:
+    """Chance of each lobe of each instance, in proportion to its share of the blend's albedo; they sum to one."""
+    albedos = [lobe_albedos(p, wi) for p in blend.instances]
+    total = sum(w * (a.diffuse + a.spec + a.clearcoat) for w, a in zip(blend.weights, albedos, strict=True))
+    shares = [w / total for w in blend.weights]
+    return tuple(
+        Albedos(s * a.diffuse, s * a.spec, s * a.clearcoat) for s, a in zip(shares, albedos, strict=True)
+    )
 
 
 def lobe_alphas(blend: Blend) -> tuple[tuple[Float, Float, Float], ...]:

@@ -29,7 +29,7 @@ CLEARCOAT_F0 = 0.04
 
 
 class Principled(NamedTuple):
-    """Parameters of one Principled BRDF, in [0, 1] each (`specular` up to 1.8); nine fields hold the paper's 11 numbers.
+    """Parameters of one Principled BRDF, in [0, 1] each (`specular` up to 1.8); the first nine hold the paper's 11.
 
     `anisotropic` stretches the specular lobe along x; `flatness` blends towards the fake subsurface of Burley 2015.
     """
@@ -60,6 +60,22 @@ class Geometry(NamedTuple):
     weight_o: Float
     weight_d: Float
     clearcoat: Float  # clearcoat lobe but for its strength and its distribution of normals
+
+
+class Terms(NamedTuple):
+    """The colour `base_color * colored + white`."""
+
+    colored: Float
+    white: Float
+
+
+class Lobes(NamedTuple):
+    """Value of an instance [1/sr], and the density of each of its lobes as a sampler of `wo` [1/sr]."""
+
+    value: Color
+    diffuse_pdf: Float
+    spec_pdf: Float
+    clearcoat_pdf: Float
 
 
 def schlick_weight(cos: Float) -> Float:
@@ -124,20 +140,9 @@ def dielectric_reflectance(cos: Float, eta: Float) -> Float:
     return 0.5 * (r_s * r_s + r_p * r_p)
 
 
-def tint_color(base_color: Color) -> Color:
-    """Hue and saturation of a colour: the colour divided by its luminance. Burley 2012, section 5.3."""
-    return base_color * (1.0 / ops.maximum(ops.luminance(base_color), 1e-6))
-
-
-def spec_reflectance(p: Principled, cos: Float, weight: Float) -> Color:
-    """Fresnel term of the specular lobe: metal, tinted and plain dielectric. `weight` is `schlick_weight(cos)`."""
-    dielectric = (
-        (1.0 - p.metallic) * (1.0 - p.spec_tint) * dielectric_reflectance(cos, specular_eta(p.specular))
-    )
-    tinted = (1.0 - p.metallic) * p.spec_tint
-    # Schlick's F0 + (1 - F0) weight for both coloured terms, collected.
-    f0 = p.base_color * p.metallic + tint_color(p.base_color) * (tinted * specular_f0(p.specular))
-    return f0 * (1.0 - weight) + (dielectric + (p.metallic + tinted) * weight)
+def luminance_inverse(base_color: Color) -> Float:
+    """Factor that strips a colour of its brightness and leaves its tint. Burley 2012, section 5.3."""
+    return 1.0 / ops.maximum(ops.luminance(base_color), 1e-6)
 
 
 def ggx(h: Vec3, h2: Float, alpha_x: Float, alpha_y: Float) -> Float:
@@ -148,18 +153,15 @@ def ggx(h: Vec3, h2: Float, alpha_x: Float, alpha_y: Float) -> Float:
     return r * r / (ops.PI * alpha_x * alpha_y)
 
 
-def gtr1_norm(alpha2: Float) -> Float:
-    """Factor that makes the projected GTR1 distribution integrate to one. Burley 2012, eq. 4."""
-    return (1.0 - alpha2) / (-ops.PI * ops.log(alpha2))
+def gtr1(h: Vec3, alpha: Float) -> Float:
+    """GTR1 distribution of normals over the squared length of the unnormalised half vector. Burley 2012, eq. 4."""
+    alpha2 = alpha * alpha
+    slope = h.x * h.x + h.y * h.y + alpha2 * h.z * h.z
+    return (1.0 - alpha2) / (-ops.PI * ops.log(alpha2) * slope)
 
 
-def gtr1_slope(h: Vec3, alpha2: Float) -> Float:
-    """1 + (alpha^2 - 1) cos^2 times the squared length of `h`, without cancellation."""
-    return h.x * h.x + h.y * h.y + alpha2 * h.z * h.z
-
-
-def eval_diffuse(p: Principled, g: Geometry) -> Color:
-    """Diffuse reflection, retro-reflection, fake subsurface and sheen, f cos(theta_o). Burley 2012, 2015 section 3."""
+def diffuse_terms(p: Principled, g: Geometry) -> Terms:
+    """Diffuse reflection, retro-reflection, fake subsurface and sheen. Burley 2012, section 5.3; 2015, section 3."""
     retro = 2.0 * p.roughness * g.cos_d * g.cos_d
     lambert = (1.0 - 0.5 * g.weight_i) * (1.0 - 0.5 * g.weight_o)
     rough = lambert + retro * (g.weight_o + g.weight_i + g.weight_o * g.weight_i * (retro - 1.0))
@@ -169,33 +171,41 @@ def eval_diffuse(p: Principled, g: Geometry) -> Color:
     # Metals have neither a diffuse base nor a sheen.
     nonmetal = (1.0 - p.metallic) * g.wo.z
     sheen = nonmetal * p.sheen * g.weight_d
-    tinted = tint_color(p.base_color) * (sheen * p.sheen_tint) + sheen * (1.0 - p.sheen_tint)
-    return p.base_color * (nonmetal * ops.INV_PI * ops.lerp(rough, flat, p.flatness)) + tinted
+    tinted = sheen * p.sheen_tint
+    colored = nonmetal * ops.INV_PI * ops.lerp(rough, flat, p.flatness)
+    return Terms(colored + tinted * luminance_inverse(p.base_color), sheen - tinted)
 
 
-def eval_spec(p: Principled, g: Geometry) -> Color:
-    """Microfacet reflection of metal and dielectric, f cos(theta_o). Walter 2007, eq. 20, separable masking."""
+def spec_fresnel(p: Principled, cos: Float, weight: Float) -> Terms:
+    """Fresnel reflectance of metal, tinted and plain dielectric together. `weight` is `schlick_weight(cos)`."""
+    tinted = (1.0 - p.metallic) * p.spec_tint
+    plain = (1.0 - p.metallic) - tinted
+    # Schlick's F0 + (1 - F0) weight for both coloured parts, collected.
+    f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
+    white = plain * dielectric_reflectance(cos, specular_eta(p.specular)) + (p.metallic + tinted) * weight
+    return Terms(f0 * (1.0 - weight), white)
+
+
+def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
+    """Value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe would be sampled."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    # D G1(wi) G1(wo) / (4 cos_i), with both maskings written as cosines over their denominators.
-    masked = g.wo.z / (
-        masking_denominator(g.wi, alpha_x, alpha_y) * masking_denominator(g.wo, alpha_x, alpha_y)
-    )
-    return spec_reflectance(p, g.cos_d, g.weight_d) * (ggx(g.h, g.h2, alpha_x, alpha_y) * masked)
-
-
-def eval_clearcoat(p: Principled, g: Geometry) -> Float:
-    """White clearcoat, f cos(theta_o). Burley 2012, section 5.6, with Mitsuba's masking (no 1 / (4 cos_i cos_o))."""
-    alpha = clearcoat_alpha(p.clearcoat_gloss)
-    alpha2 = alpha * alpha
-    return p.clearcoat * g.clearcoat * gtr1_norm(alpha2) * g.h2 / gtr1_slope(g.h, alpha2)
-
-
-def eval_geometry(p: Principled, g: Geometry) -> Color:
-    """All lobes of one instance, f cos(theta_o) [1/sr], for a pair of directions that `geometry` prepared."""
-    return eval_diffuse(p, g) + eval_spec(p, g) + eval_clearcoat(p, g)
+    # Density of visible normals as reflected directions, D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
+    spec_pdf = 0.5 * ggx(g.h, g.h2, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
+    # The value adds Fresnel and the other masking. Walter 2007, eq. 20, separable masking.
+    spec = spec_pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y))
+    # Normals drawn from D cos(theta_h), as reflected directions: D cos(theta_h) / (4 cos_d).
+    clearcoat_d = gtr1(g.h, clearcoat_alpha(p.clearcoat_gloss))
+    clearcoat_pdf = 0.5 * clearcoat_d * g.h.z
+    clearcoat = p.clearcoat * clearcoat_d * g.h2 * g.clearcoat
+    # Every lobe is the base colour times one number plus another.
+    diffuse = diffuse_terms(p, g)
+    fresnel = spec_fresnel(p, g.cos_d, g.weight_d)
+    colored = diffuse.colored + spec * fresnel.colored
+    white = diffuse.white + spec * fresnel.white + clearcoat
+    return Lobes(p.base_color * colored + white, g.wo.z * ops.INV_PI, spec_pdf, clearcoat_pdf)
 
 
 def eval_principled(p: Principled, wi: Vec3, wo: Vec3) -> Color:
     """f cos(theta_o) [1/sr] of one instance, zero below the horizon. `wi` and `wo` are unit vectors."""
     g = geometry(wi, wo)
-    return ops.select(g.valid, eval_geometry(p, g), 0.0)
+    return ops.select(g.valid, eval_pdf_lobes(p, g).value, 0.0)
