@@ -24,6 +24,11 @@ SYSTEM_PACKAGES = {
         "arch": "sudo pacman -S python",
         "macos": "brew install python@3.12",
     },
+    "libatomic": {
+        "debian": "sudo apt-get install libatomic1",
+        "fedora": "sudo dnf install libatomic",
+        "arch": "sudo pacman -S gcc-libs",
+    },
     "nvidia": {
         "debian": "sudo apt-get install nvidia-driver (Ubuntu: sudo ubuntu-drivers install)",
         "fedora": "sudo dnf install akmod-nvidia xorg-x11-drv-nvidia-cuda",
@@ -55,6 +60,7 @@ def check() -> list[Finding]:
     needed = ("drjit", "mitsuba", "numpy", "safetensors", "zarr", "matplotlib")
     return [
         _python(),
+        *([_libatomic()] if sys.platform == "linux" else []),
         _llvm(),  # before the modules, as Dr.Jit looks for libLLVM when it is imported
         *(_module(name) for name in needed),
         _cuda(),
@@ -78,6 +84,14 @@ def _python() -> Finding:
     return Finding("Python", False, f"{found}, {wanted} or later is needed", _advice("python"))
 
 
+def _libatomic() -> Finding:
+    try:
+        ctypes.CDLL("libatomic.so.1")
+    except OSError:
+        return Finding("libatomic", False, "libatomic.so.1 is missing, Dr.Jit needs it", _advice("libatomic"))
+    return Finding("libatomic", True, "libatomic.so.1")
+
+
 def _llvm() -> Finding:
     try:
         ensure_llvm()
@@ -93,7 +107,7 @@ def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
     distribution = distribution or name
     try:
         importlib.import_module(name)
-    except ImportError as error:
+    except Exception as error:  # a library that a module links may be missing: not always an ImportError
         found = f"for {purpose}; not installed" if purpose else f"cannot be imported: {error}"
         fix = f"{sys.executable} -m pip install '{_requirement(distribution)}'"
         return Finding(name, False, found, fix, bool(purpose))

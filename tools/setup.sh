@@ -3,8 +3,9 @@
 #
 #     tools/setup.sh demo|test
 #
-# Needs Python 3.11 or later. What the system lacks (venv, libLLVM) is installed with apt-get where we are root on Debian or
-# Ubuntu; otherwise the command to type is printed and we stop. PYTHON=/path/to/python3 chooses the interpreter.
+# Needs Python 3.11 or later. What the system lacks (venv, libatomic, libLLVM) is installed with apt-get where we are
+# root on Debian or Ubuntu; otherwise the command to type is printed and we stop. PYTHON=/path/to/python3 chooses the
+# interpreter.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -18,11 +19,11 @@ install_system() {
         die "this needs a system package, please run: sudo apt-get install $1   and then the same command again"
     fi
     say "setup: updating the package lists"
-    apt-get update -qq >&2 || say "setup: apt-get update failed, going on with the lists there are"
+    apt-get update -qq >/dev/null || say "setup: apt-get update failed, going on with the lists there are"
     for package in "$@"; do
         if apt-cache show "$package" >/dev/null 2>&1; then
             say "setup: installing $package"
-            DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$package" >&2 ||
+            DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$package" >/dev/null ||
                 die "could not install $package"
             return 0
         fi
@@ -53,6 +54,13 @@ make_venv() {
     "$python" -m venv .venv
 }
 
+# Dr.Jit's wheel links libatomic on Linux, which a minimal system lacks.
+install_libatomic() {
+    [ "$(uname -s)" = Linux ] || return 0
+    .venv/bin/python -c 'import ctypes; ctypes.CDLL("libatomic.so.1")' 2>/dev/null && return 0
+    install_system libatomic1 || die "libatomic.so.1 is missing; install it with your package manager"
+}
+
 install_llvm() {
     fault=$(.venv/bin/python -I nma/llvm.py) && return 0
     [ -z "${DRJIT_LIBLLVM_PATH:-}" ] || die "DRJIT_LIBLLVM_PATH: $fault; unset it"
@@ -78,5 +86,6 @@ test) extra=dev ;;
 *) die "usage: tools/setup.sh demo|test" ;;
 esac
 make_venv
+install_libatomic
 install_llvm
 install_package ".venv/installed-$1" "$extra"
