@@ -1,0 +1,118 @@
+"""The adapter: (parameters of a source material, wi) -> parameters of the analytic target, paper eq. 4."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nma import encoding, network, ops, weights
+from nma.errors import WeightsError
+from nma.network import Layers
+from nma.ops import Float
+from nma.params import SPACES, ParamSpace
+from nma.target.blend import Blend
+from nma.target.decode import TargetParam, decode, numbers, output_size, params_from_json, params_to_json
+from nma.target.principled import DIALECT
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the adapters that come with the package."""
+    return tuple(sorted(p.name.removesuffix(".safetensors") for p in files("nma.adapters").iterdir() if p.name.endswith(".safetensors")))
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """A trained network with all that belongs to it. `Adapter.load` reads one, `prepare` applies it."""
+
+    space: ParamSpace
+    encoding: str
+    layers: Layers
+    instances: int
+    directional: bool
+    target: tuple[TargetParam, ...]
+    training: dict[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def load(name_or_path: str | Path) -> Adapter:
+        """A shipped adapter by name, or one from a weights file. Raises `WeightsError`."""
+        path = Path(name_or_path)
+        if str(name_or_path) in shipped():
+            path = Path(str(files("nma.adapters").joinpath(f"{name_or_path}.safetensors")))
+        elif path.suffix != ".safetensors" and not path.exists():
+            raise WeightsError(f"'{name_or_path}' is neither a file nor a shipped adapter ({', '.join(shipped())})")
+        header, layers = weights.read(path)
+        adapter = Adapter(
+            SPACES[header.class_name],
+            header.encoding,
+            layers,
+            header.instances,
+            header.directional,
+            params_from_json(header.target),
+            header.training,
+        )
+        adapter._check(path, header.dialect)
+        return adapter
+
+    def save(self, path: str | Path) -> None:
+        """Writes a weights file, atomically."""
+        header = weights.Header(
+            class_name=self.space.name,
+            parameters=weights.describe(self.space),
+            encoding=self.encoding,
+            hidden=[m.shape[0] for m, _ in self.layers[:-1]],
+            instances=self.instances,
+            directional=self.directional,
+            reciprocal=not self.directional,
+            dialect=DIALECT,
+            target=params_to_json(self.target),
+            training=self.training,
+        )
+        weights.write(path, header, self.layers)
+
+    @property
+    def variant(self) -> str:
+        """The paper's name: single, omega_i, blended, or blended + omega_i."""
+        names = ["blended"] if self.instances > 1 else []
+        names += ["omega_i"] if self.directional else []
+        return " + ".join(names) or "single"
+
+    @property
+    def size(self) -> int:
+        """How many numbers describe the target: 23 for a blend of two."""
+        return output_size(self.instances, self.target)
+
+    def prepare(self, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
+        """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,)."""
+        inputs = encoding.get(self.encoding)(columns, cos_theta_i if self.directional else None)
+        if ops.library(*columns, cos_theta_i) == "drjit":
+            raw = network.forward_lanes(self.layers, inputs)
+        else:
+            lanes = np.broadcast_arrays(cos_theta_i, *inputs)[1:]
+            raw = list(network.forward(self.layers, np.stack(lanes, axis=-1).astype(np.float32)).T)
+        return decode(raw, self.instances, self.target)
+
+    def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
+        """Target parameters (m, n, size) of m materials (m, columns) at n cosines (n,): curves over cos(theta_i)."""
+        p = np.atleast_2d(np.asarray(params, np.float64))
+        mu = np.asarray(cos_theta_i, np.float64)
+        columns = [np.repeat(c, len(mu)) for c in p.T]
+        flat = numbers(self.prepare(columns, np.tile(mu, len(p))), self.target)
+        lanes = np.broadcast_arrays(*flat)
+        return np.stack(lanes, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
+
+    def _check(self, path: Path, dialect: str) -> None:
+        """Refuses a network that does not fit its own description."""
+        inputs = encoding.size(self.encoding, self.space, self.directional)
+        if self.layers[0][0].shape[1] != inputs or self.layers[-1][0].shape[0] != self.size:
+            raise WeightsError(
+                f"{path}: the network maps {self.layers[0][0].shape[1]} inputs to {self.layers[-1][0].shape[0]} outputs, "
+                f"its description says {inputs} to {self.size}; train again"
+            )
+        if dialect != DIALECT:
+            raise WeightsError(f"{path}: written for the Principled dialect '{dialect}', this version evaluates '{DIALECT}'")

@@ -1,0 +1,63 @@
+"""What the network sees: a class's parameters and cos(theta_i), turned into about unit-sized numbers.
+
+Written with `nma.ops`, so that training, rendering and generated shaders share it. An encoding's name is stored in the
+weights file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from nma import ops
+from nma.errors import WeightsError
+from nma.microfacet import fresnel_conductor, fresnel_dielectric
+from nma.ops import Float
+from nma.params import LAYERED3, ParamSpace
+
+# Takes one array per parameter column, and cos(theta_i) or None for an adapter whose parameters ignore the direction.
+Encoder = Callable[[Sequence[Float], Float | None], list[Float]]
+
+# Cosine of 84 degrees: where the reflectance of metals dips before it rises to 1.
+_GRAZING = 0.1045
+
+
+def raw(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]:
+    """The parameters as they are, then cos(theta_i): the paper's input."""
+    return [*columns] if cos_theta_i is None else [*columns, cos_theta_i]
+
+
+def direction(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]:
+    """cos(theta_i) alone, scaled to [-1, 1], or the constant 1: the input of an adapter for one material."""
+    return [1.0] if cos_theta_i is None else [2.0 * cos_theta_i - 1.0]
+
+
+def layered3(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]:
+    """Physical quantities of a coated conductor: widths by their logarithm, the conductor by its reflectance inside the
+    coat at normal incidence and at 84 degrees, the coat's own Fresnel term at wi and the medium's transmittance along
+    the refracted direction."""
+    alpha_top, alpha_bottom, eta_top, *rest = columns
+    eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
+    ranged = (("alpha_top", alpha_top), ("alpha_bottom", alpha_bottom), ("eta_top", eta_top), ("sigma_t", sigma_t))
+    unit = [LAYERED3[name].normalise(x) for name, x in ranged]
+    for cosine in (1.0, _GRAZING):
+        unit += [fresnel_conductor(cosine, e / eta_top, x / eta_top) for e, x in zip(eta, k, strict=True)]
+    unit += albedo
+    if cos_theta_i is not None:
+        fresnel, cos_t = fresnel_dielectric(cos_theta_i, eta_top)
+        unit += [cos_theta_i, fresnel, ops.exp(-sigma_t / ops.maximum(cos_t, 0.05))]
+    return [2.0 * x - 1.0 for x in unit]
+
+
+ENCODERS: dict[str, Encoder] = {"raw": raw, "direction": direction, "layered3": layered3}
+
+
+def get(name: str) -> Encoder:
+    """The encoder called `name`; `WeightsError` for one this version does not know."""
+    if name not in ENCODERS:
+        raise WeightsError(f"unknown input encoding '{name}'; this version knows {', '.join(ENCODERS)}: upgrade the package")
+    return ENCODERS[name]
+
+
+def size(name: str, space: ParamSpace, directional: bool) -> int:
+    """Number of network inputs that an encoding makes of a class, with or without the direction."""
+    return len(get(name)([0.5] * space.size, 0.5 if directional else None))

@@ -1,0 +1,64 @@
+"""Figures of merit of tables: means over bins and RGB of f cos(theta_o) [1/sr], one set per material.
+
+`a` is the adapter's table, `b` the reference, both (..., theta_i, theta_o, phi, 3).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Keeps relative errors finite in dark bins [1/sr].
+EPS = 1e-2
+# Equally likely values of a standard normal variable, for the noise floor.
+_NORMAL = np.array([0.0392, 0.1181, 0.1978, 0.2793, 0.3634, 0.4511, 0.5436, 0.6425, 0.7500, 0.8694, 1.0061, 1.1700, 1.3830, 1.7317])
+
+FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")
+
+
+def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
+    """All figures of one material; `error` is the reference's standard error per bin.
+
+    log_loss: eq. 7. ae: |a - b|. smape: 2 |a - b| / (|a| + |b| + EPS). mape: |a - b| / (b + EPS). mrse: (a - b)^2 /
+    (b^2 + EPS). psnr: 10 log10(peak^2 / mean (a - b)^2) dB, peak the reference's brightest bin. albedo_error: mean over
+    theta_i and RGB of the difference of directional albedos. noise_floor: log loss that a perfect model would have.
+    """
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    difference = np.abs(a - b)
+    mse = np.mean(difference**2)
+    return {
+        "log_loss": float(np.mean(np.abs(np.log1p(a) - np.log1p(b)))),
+        "ae": float(difference.mean()),
+        "smape": float(np.mean(2 * difference / (np.abs(a) + np.abs(b) + EPS))),
+        "mape": float(np.mean(difference / (b + EPS))),
+        "mrse": float(np.mean(difference**2 / (b**2 + EPS))),
+        "psnr": float(10 * np.log10(b.max() ** 2 / mse)) if mse > 0 and b.max() > 0 else math.inf,
+        "albedo_error": float(np.mean(np.abs(_albedo(a) - _albedo(b)))),
+        "noise_floor": noise_floor(b, error),
+    }
+
+
+def noise_floor(b: NDArray, error: NDArray) -> float:
+    """Mean of E|log(1 + b + e) - log(1 + b)|, e normal with standard deviation `error`."""
+    b, error = b.astype(np.float64), error.astype(np.float64)
+    base = np.log1p(b)
+    total = 0.0
+    for z in (*_NORMAL, *-_NORMAL):
+        total += float(np.mean(np.abs(np.log1p(np.maximum(b + z * error, -0.999)) - base)))
+    return total / (2 * len(_NORMAL))
+
+
+def counting_error(b: NDArray, walks: int, solid_angle: float, rows: int) -> NDArray[np.float64]:
+    """Standard error per bin estimated from the number of walks alone, as if every throughput were 1 (an upper bound)."""
+    return np.sqrt(np.maximum(b, 0.0).astype(np.float64) * rows / (walks * solid_angle))
+
+
+def mean_metrics(materials: list[dict[str, float]]) -> dict[str, float]:
+    """Means over materials of each figure."""
+    return {name: float(np.mean([m[name] for m in materials])) for name in FIGURES}
+
+
+def _albedo(table: NDArray) -> NDArray:
+    return 2.0 * math.pi * table.mean(axis=(-3, -2))

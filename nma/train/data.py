@@ -1,0 +1,120 @@
+"""Batches of bins, drawn with NumPy from tables in memory, each step's draw determined by (seed, step) alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from queue import Queue
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.table import ISOTROPIC, Grid, Tables
+from nma.train.recipe import Recipe
+
+
+class Batch(NamedTuple):
+    """Bins of one step; rows come last so that everything per row broadcasts along contiguous memory."""
+
+    columns: NDArray[np.float32]  # (parameters, rows)
+    mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs
+    i: NDArray[np.float32]  # (rows,) bin of cos(theta_i)
+    o: NDArray[np.float32]  # (bins_per_row, rows)
+    p: NDArray[np.float32]  # (bins_per_row, rows)
+    shift: NDArray[np.float32]  # (3, bins_per_row, rows) random shift of the points' lattice
+    weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, undoes the choice of bins
+    value: NDArray[np.float32]  # (3, bins_per_row, rows) the table
+    quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to a bin
+
+
+@dataclass
+class Pool:
+    """Tables that batches are drawn from; `replace` exchanges some of them while training streams."""
+
+    params: NDArray[np.float32]
+    values: NDArray[np.floating]
+    walks: NDArray[np.int64]
+    grid: Grid = ISOTROPIC
+
+    @staticmethod
+    def of(tables: Tables) -> Pool:
+        return Pool(tables.params.astype(np.float32), tables.values, tables.walks)
+
+    def replace(self, first: int, tables: Tables) -> None:
+        """Overwrites the materials from `first` on, wrapping around."""
+        at = (first + np.arange(len(tables.params))) % len(self.params)
+        self.params[at], self.values[at], self.walks[at] = tables.params, tables.values, tables.walks
+
+
+class BinSampler:
+    """Chooses bins of wo for rows of wi, and says by how much each choice must count."""
+
+    def __init__(self, law: str, grid: Grid = ISOTROPIC):
+        self.grid = grid
+        self.uniform_share = 1.0 if law == "uniform" else 0.5
+        # Cauchy-like falloff over a few bins from the mirror direction, in each coordinate.
+        steps = np.arange(grid.theta_o)
+        near_o = 1.0 / (1.0 + ((steps[None, :] - steps[:, None]) / 1.5) ** 2)
+        self._o = near_o / near_o.sum(axis=1, keepdims=True)
+        near_p = 1.0 / (1.0 + ((grid.phi_o - 1 - np.arange(grid.phi_o)) / 1.5) ** 2)
+        self._p = near_p / near_p.sum()
+        self._cdf_o = np.cumsum(self._o, axis=1)
+        self._cdf_p = np.cumsum(self._p)
+
+    def draw(self, rng: np.random.Generator, i: NDArray, count: int) -> tuple[NDArray, NDArray, NDArray]:
+        """(o, p, weight), each (count, rows), for the rows' bins `i` (rows,)."""
+        u = rng.random((2, count, len(i)))
+        o = (u[0] * self.grid.theta_o).astype(np.int64)
+        p = (u[1] * self.grid.phi_o).astype(np.int64)
+        split = round(count * self.uniform_share)
+        near = np.broadcast_to(i, (count - split, len(i)))
+        o[split:] = (u[0, split:, :, None] > self._cdf_o[near]).sum(axis=-1)
+        p[split:] = np.searchsorted(self._cdf_p, u[1, split:])
+        o, p = np.minimum(o, self.grid.theta_o - 1), np.minimum(p, self.grid.phi_o - 1)
+        bins = self.grid.theta_o * self.grid.phi_o
+        share = split / count
+        density = share / bins + (1.0 - share) * self._o[i[None, :], o] * self._p[p]
+        return o, p, 1.0 / (bins * density)
+
+
+def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
+    """The bins of one step."""
+    rng = np.random.default_rng((recipe.seed, step, 0xB17))
+    m = rng.integers(len(pool.params), size=recipe.rows)
+    i = rng.integers(pool.grid.theta_i, size=recipe.rows)
+    o, p, weight = sampler.draw(rng, i, recipe.bins_per_row)
+    f32 = np.float32
+    return Batch(
+        np.ascontiguousarray(pool.params[m].T),
+        ((i + rng.random(recipe.rows)) / pool.grid.theta_i).astype(f32),
+        i.astype(f32),
+        o.astype(f32),
+        p.astype(f32),
+        rng.random((3, *o.shape), dtype=f32),
+        weight.astype(f32),
+        np.moveaxis(pool.values[m, i, o, p], -1, 0).astype(f32),
+        (pool.grid.theta_i / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
+    )
+
+
+def batches(source: Callable[[int], Batch], start: int, stop: int, group: int) -> Iterator[tuple[int, Batch]]:
+    """(first step, `group` steps stacked) from `start` to `stop`, prepared by a thread ahead of their use."""
+    queue: Queue = Queue(maxsize=2)
+
+    def produce() -> None:
+        try:
+            for first in range(start, stop, group):
+                steps = [source(s) for s in range(first, min(first + group, stop))]
+                queue.put((first, Batch(*(np.stack(parts) for parts in zip(*steps, strict=True)))))
+            queue.put(None)
+        except BaseException as e:  # handed to the consumer, which raises it
+            queue.put(e)
+
+    threading.Thread(target=produce, daemon=True).start()
+    while (item := queue.get()) is not None:
+        if isinstance(item, BaseException):
+            raise item
+        yield item
+

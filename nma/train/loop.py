@@ -1,0 +1,168 @@
+"""The optimisation loop: Adam, schedules, weight averaging, checkpoints that a killed run resumes from."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from nma.errors import NmaError
+from nma.network import Layers
+from nma.train.data import Batch, batches
+from nma.train.loss import loss
+from nma.train.recipe import Recipe
+
+# Steps per call of the compiled function.
+GROUP = 50
+_CHECKPOINT_SECONDS = 60.0
+# The plateau schedule compares means of the loss over windows of this many groups.
+_PATIENCE = 6
+_MIN_SCALE = 1e-3
+
+
+class State(NamedTuple):
+    """All that a step changes."""
+
+    layers: Layers
+    averaged: Layers
+    optimiser: Any
+
+
+@dataclass
+class Run:
+    """A run's progress: the steps done, the losses so far (one per step), and the time spent."""
+
+    state: State
+    step: int = 0
+    losses: list[float] = field(default_factory=list)
+    log_losses: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    scale: float = 1.0
+
+
+def start(recipe: Recipe, layers: Layers) -> Run:
+    """A run that has not done any step."""
+    layers = [(jnp.asarray(m, jnp.float32), jnp.asarray(b, jnp.float32)) for m, b in layers]
+    return Run(State(layers, layers, _optimiser(recipe).init(layers)))
+
+
+def train(
+    recipe: Recipe,
+    run: Run,
+    source: Callable[[int], Batch],
+    *,
+    checkpoint: Path | None = None,
+    progress: Callable[[Run], None] = lambda run: None,
+    budget_seconds: float = float("inf"),
+) -> Run:
+    """Continues `run` to the recipe's last step, or until the time budget is spent; returns it.
+
+    `source(step)` gives a step's batch and must depend on nothing but the step. With `checkpoint`, progress is written
+    there every minute and at the end.
+    """
+    saved = began = time.perf_counter()
+    before = run.seconds
+    for _first, group in batches(source, run.step, recipe.steps, GROUP):
+        run.state, values = _group(run.state, group, run.scale, recipe)
+        values = np.asarray(values)
+        if not np.isfinite(values).all():
+            raise NmaError(
+                f"the loss is not finite at step {run.step + int(np.argmin(np.isfinite(values[:, 0])))}; "
+                "lower the learning rate, or resume from the last checkpoint with another seed"
+            )
+        run.losses += values[:, 0].tolist()
+        run.log_losses += values[:, 1].tolist()
+        run.step += len(values)
+        now = time.perf_counter()
+        run.seconds = before + now - began
+        if recipe.schedule == "plateau":
+            run.scale = _plateau(run)
+        if checkpoint and now - saved > _CHECKPOINT_SECONDS:
+            save(run, recipe, checkpoint)
+            saved = now
+        progress(run)
+        if run.seconds > budget_seconds or run.scale < _MIN_SCALE:
+            break
+    if checkpoint:
+        save(run, recipe, checkpoint)
+    return run
+
+
+def result(run: Run, recipe: Recipe) -> Layers:
+    """The trained layers as NumPy arrays: the averaged ones where the recipe averages."""
+    layers = run.state.averaged if recipe.average > 0 else run.state.layers
+    return [(np.asarray(m), np.asarray(b)) for m, b in layers]
+
+
+def _schedule(recipe: Recipe) -> optax.Schedule:
+    if recipe.schedule == "onecycle":
+        return optax.cosine_onecycle_schedule(recipe.steps, recipe.learning_rate, pct_start=0.1, div_factor=10, final_div_factor=100)
+    return optax.constant_schedule(recipe.learning_rate)
+
+
+def _optimiser(recipe: Recipe) -> optax.GradientTransformation:
+    return optax.adam(_schedule(recipe))
+
+
+@partial(jax.jit, static_argnames="recipe")
+def _group(state: State, group: Batch, scale: float, recipe: Recipe) -> tuple[State, jax.Array]:
+    """The steps of one group: the new state and (loss, log loss) of each step."""
+    optimiser = _optimiser(recipe)
+
+    def step(state: State, batch: Batch) -> tuple[State, jax.Array]:
+        (value, log_loss), gradient = jax.value_and_grad(loss, has_aux=True)(state.layers, batch, recipe)
+        updates, inner = optimiser.update(gradient, state.optimiser)
+        layers = optax.apply_updates(state.layers, jax.tree.map(lambda u: u * scale, updates))
+        averaged = optax.incremental_update(layers, state.averaged, 1.0 - recipe.average)
+        return State(layers, averaged, inner), jnp.stack([value, log_loss])
+
+    return jax.lax.scan(step, state, group)
+
+
+def _plateau(run: Run) -> float:
+    """Halves the step where the mean loss of the last window is no better than that of the one before."""
+    window = _PATIENCE * GROUP
+    if run.step % window or run.step < 2 * window:
+        return run.scale
+    recent, earlier = np.mean(run.losses[-window:]), np.mean(run.losses[-2 * window : -window])
+    return run.scale * (0.5 if recent > 0.99 * earlier else 1.0)
+
+
+def save(run: Run, recipe: Recipe, path: Path) -> None:
+    """Writes a checkpoint, atomically."""
+    leaves = jax.tree.leaves(run.state)
+    arrays = {f"leaf{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+    notes = {"recipe": asdict(recipe), "step": run.step, "seconds": run.seconds, "scale": run.scale}
+    partial_path = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    with partial_path.open("wb") as f:
+        np.savez(f, notes=json.dumps(notes), losses=run.losses, log_losses=run.log_losses, **arrays)
+    partial_path.replace(path)
+
+
+def resume(recipe: Recipe, layers: Layers, path: Path) -> Run:
+    """The run stored in a checkpoint, or a new one if there is none. Another recipe is refused."""
+    run = start(recipe, layers)
+    if not path.exists():
+        return run
+    try:
+        with np.load(path) as f:
+            notes = json.loads(str(f["notes"]))
+            leaves = [f[f"leaf{k}"] for k in range(len(jax.tree.leaves(run.state)))]
+            losses, log_losses = f["losses"].tolist(), f["log_losses"].tolist()
+    except Exception as e:
+        raise NmaError(f"{path}: damaged checkpoint ({e}); delete it to start again") from None
+    if notes["recipe"] != asdict(recipe):
+        changed = [k for k, v in asdict(recipe).items() if notes["recipe"].get(k) != v]
+        raise NmaError(f"{path} belongs to a run with other settings ({', '.join(changed)}); delete it, or restore them")
+    state = jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(x) for x in leaves])
+    return Run(state, notes["step"], losses, log_losses, notes["seconds"], notes["scale"])

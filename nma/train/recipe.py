@@ -1,0 +1,90 @@
+"""What a training run does, as data: stored with the weights, so that the run can be repeated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from nma.errors import NmaError
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Settings of a training run.
+
+    A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, one network pass per row, and
+    averages the target over `points` points per bin.
+
+    - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
+      one point in the middle of the bin (point supervision).
+    - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
+    - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so
+      that noisy bins pull towards their mean rather than their median.
+    - `schedule`: "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls, "constant" keeps it.
+    - `average`: decay of the exponential moving average of the weights; 0 means none.
+    """
+
+    network: str = "5x64"
+    instances: int = 2
+    directional: bool = True
+    encoding: str = "layered3"
+    rows: int = 512
+    bins_per_row: int = 8
+    points: int = 8
+    points_law: Literal["crowded", "uniform", "centre"] = "crowded"
+    bins_law: Literal["mirror", "uniform"] = "mirror"
+    loss: Literal["huber", "log"] = "huber"
+    schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
+    learning_rate: float = 3e-3
+    average: float = 0.999
+    steps: int = 100_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        positive = ("rows", "bins_per_row", "points", "steps", "learning_rate", "instances")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise NmaError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 <= self.average < 1:
+            raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
+
+    @property
+    def bins_per_step(self) -> int:
+        return self.rows * self.bins_per_row
+
+
+CLASS = Recipe()
+
+# The paper's recipe (section 3.4), for comparison.
+PAPER = Recipe(
+    encoding="raw",
+    rows=1000,
+    bins_per_row=1,
+    points=20,
+    points_law="uniform",
+    bins_law="uniform",
+    loss="log",
+    learning_rate=1e-5,
+    average=0.0,
+)
+
+# One material: a small network that sees the direction alone.
+SINGLE = Recipe(
+    network="3x32",
+    encoding="direction",
+    rows=160,
+    bins_per_row=16,
+    schedule="plateau",
+    learning_rate=5e-3,
+    average=0.99,
+    steps=6_000,
+)
+
+PRESETS = {"class": CLASS, "paper": PAPER, "single": SINGLE}
+
+
+def preset(name: str, **changes) -> Recipe:
+    """The preset `name` with some settings changed; `None` leaves a setting as it is."""
+    if name not in PRESETS:
+        raise NmaError(f"unknown preset '{name}'; known are {', '.join(PRESETS)}")
+    return replace(PRESETS[name], **{k: v for k, v in changes.items() if v is not None})
