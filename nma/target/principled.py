@@ -7,6 +7,8 @@ Deliberate differences from Mitsuba's plugin, all of them small:
 - Peaks of narrow lobes keep their digits: GGX and GTR1 are written with the components of the half vector, never with
   1 + (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is off by several per cent at alpha .001.
 - `specular` may vary like every other number, and 0 means no dielectric reflection (Mitsuba replaces 0 by .001).
+- The cosine between a direction and the half vector is |wi + wo| / 2, the same for both directions. Mitsuba takes the
+  dot product of `wi`, which rounding spoils where the directions are nearly opposite: both grazing, forward.
 - Tints divide by max(luminance, 1e-6), so they fade for colours darker than that instead of switching to white at zero.
 - Directions within 1e-9 of the horizon are invalid, as are those below it (no back side).
 - Lobes are chosen by their estimated albedo, and one density covers the whole blend (`nma.target.blend`).
@@ -19,6 +21,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from nma import ops
+from nma.microfacet import ggx_d
 from nma.ops import Color, Float, Mask, Vec3
 
 DIALECT = "mitsuba-principled-reflection"
@@ -53,8 +56,7 @@ class Geometry(NamedTuple):
     valid: Mask  # both directions above the horizon
     wi: Vec3
     wo: Vec3
-    h: Vec3  # wi + wo, not normalised
-    h2: Float  # its squared length
+    h: Vec3  # half vector
     cos_d: Float  # cosine between either direction and the half vector
     weight_i: Float  # Schlick weights of the three cosines
     weight_o: Float
@@ -99,14 +101,15 @@ def geometry(wi: Vec3, wo: Vec3) -> Geometry:
     i = Vec3(wi.x, wi.y, ops.select(valid, wi.z, 1.0))
     o = Vec3(wo.x, wo.y, ops.select(valid, wo.z, 1.0))
     h = i + o
-    h2 = ops.dot(h, h)
-    cos_d = ops.minimum(0.5 * ops.sqrt(h2), 1.0)
+    length = ops.sqrt(ops.dot(h, h))
+    cos_d = 0.5 * length
     weight_d = schlick_weight(cos_d)
     fresnel = CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * weight_d
     masking_i = 2.0 * i.z / masking_denominator(i, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
     masking_o = 2.0 * o.z / masking_denominator(o, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
     clearcoat = 0.25 * fresnel * masking_i * masking_o * o.z
-    return Geometry(valid, i, o, h, h2, cos_d, schlick_weight(i.z), schlick_weight(o.z), weight_d, clearcoat)
+    m = h * (1.0 / length)
+    return Geometry(valid, i, o, m, cos_d, schlick_weight(i.z), schlick_weight(o.z), weight_d, clearcoat)
 
 
 def spec_alpha(roughness: Float, anisotropic: Float) -> tuple[Float, Float]:
@@ -145,19 +148,14 @@ def luminance_inverse(base_color: Color) -> Float:
     return 1.0 / ops.maximum(ops.luminance(base_color), 1e-6)
 
 
-def ggx(h: Vec3, h2: Float, alpha_x: Float, alpha_y: Float) -> Float:
-    """GGX distribution of normals for an unnormalised half vector [1/sr]. Burley 2012, eq. 13."""
-    sx = h.x / alpha_x
-    sy = h.y / alpha_y
-    r = h2 / (sx * sx + sy * sy + h.z * h.z)
-    return r * r / (ops.PI * alpha_x * alpha_y)
+def gtr1_d(m: Vec3, alpha: Float) -> Float:
+    """GTR1 distribution of normals [1/sr], with 1 + (alpha^2 - 1) cos^2 written as sin^2 + alpha^2 cos^2.
 
-
-def gtr1(h: Vec3, alpha: Float) -> Float:
-    """GTR1 distribution of normals over the squared length of the unnormalised half vector. Burley 2012, eq. 4."""
+    Burley 2012, eq. 4.
+    """
     alpha2 = alpha * alpha
-    slope = h.x * h.x + h.y * h.y + alpha2 * h.z * h.z
-    return (1.0 - alpha2) / (-ops.PI * ops.log(alpha2) * slope)
+    e = m.x * m.x + m.y * m.y + alpha2 * m.z * m.z
+    return (1.0 - alpha2) / (-ops.PI * ops.log(alpha2) * e)
 
 
 def diffuse_terms(p: Principled, g: Geometry) -> Terms:
@@ -190,13 +188,13 @@ def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     """Value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe would be sampled."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
     # Density of visible normals as reflected directions, D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
-    spec_pdf = 0.5 * ggx(g.h, g.h2, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
+    spec_pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
     # The value adds Fresnel and the other masking. Walter 2007, eq. 20, separable masking.
     spec = spec_pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y))
     # Normals drawn from D cos(theta_h), as reflected directions: D cos(theta_h) / (4 cos_d).
-    clearcoat_d = gtr1(g.h, clearcoat_alpha(p.clearcoat_gloss))
-    clearcoat_pdf = 0.5 * clearcoat_d * g.h.z
-    clearcoat = p.clearcoat * clearcoat_d * g.h2 * g.clearcoat
+    clearcoat_d = gtr1_d(g.h, clearcoat_alpha(p.clearcoat_gloss))
+    clearcoat_pdf = clearcoat_d * g.h.z / (4.0 * g.cos_d)
+    clearcoat = p.clearcoat * clearcoat_d * g.clearcoat
     # Every lobe is the base colour times one number plus another.
     diffuse = diffuse_terms(p, g)
     fresnel = spec_fresnel(p, g.cos_d, g.weight_d)
