@@ -1,0 +1,181 @@
+"""Contact sheets: a grid of pictures with column headings, row labels, a line or two under each, and a table below."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from nma.image_io import ImageError, as_image, to_8bit, tonemap, write_png
+
+PAPER, INK, QUIET, RULE = (250, 249, 246), (32, 33, 36), (104, 106, 110), (214, 212, 206)
+TITLE_SIZE, TEXT_SIZE, CAPTION_SIZE, GAP, MARGIN = 22, 15, 13, 14, 26
+
+
+class Row(NamedTuple):
+    """One row of a contact sheet.
+
+    `images`: linear float32 (height, width, 3), tone-mapped here, or bytes, shown as they are; one for each column.
+    `label`: the row's name. `captions`: text under each image, lines parted by a newline; may be shorter than `images`.
+    """
+
+    label: str
+    images: Sequence[NDArray]
+    captions: Sequence[str] = ()
+
+
+def contact_sheet(
+    path: str | Path,
+    rows: Sequence[Row],
+    columns: Sequence[str],
+    *,
+    title: str = "",
+    table: Sequence[Sequence[str]] = (),
+    note: str = "",
+    exposure: float = 0.0,
+    shoulder: float = 0.8,
+) -> NDArray[np.uint8]:
+    """Lay out a grid of pictures and write it as a PNG.
+
+    Args:
+        path: the PNG; written atomically.
+        rows: see `Row`; all images of one size.
+        columns: headings, one for each column.
+        title: a line on top.
+        table: rows of text cells below the pictures; the first row is the heading, the first column is left-aligned.
+        note: a quiet line at the bottom, such as the tone mapping or the machine.
+        exposure, shoulder: tone mapping of linear images, see `nma.image_io.tonemap`.
+
+    Returns:
+        The sheet as (height, width, 3) bytes.
+
+    Raises:
+        ImageError: no rows, a row without one image for each column, images of different sizes, NaN or infinity.
+    """
+    pictures = [[_display(image, row.label, exposure, shoulder) for image in row.images] for row in rows]
+    height, width = _common_size(pictures, columns)
+    row_height = _line(TEXT_SIZE) + 4 + height + _caption_height(rows) + GAP
+    head = MARGIN + (_line(TITLE_SIZE) + GAP if title else 0)
+    top = head + _line(TEXT_SIZE) + 4
+    below = top + len(rows) * row_height
+    note_top = below + _table_height(table) + (GAP if table else 0)
+    bottom = note_top + (len(note.split("\n")) * _line(CAPTION_SIZE) if note else 0) + MARGIN
+    grid_width = len(columns) * (width + GAP) - GAP
+    words = max(_width(title, TITLE_SIZE, bold=True), _width(note, CAPTION_SIZE), _table_width(table))
+    content = max(grid_width, words)
+
+    sheet = Image.new("RGB", (content + 2 * MARGIN, bottom), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    _text(draw, (MARGIN, MARGIN), title, TITLE_SIZE, bold=True)
+    for index, name in enumerate(columns):
+        middle = MARGIN + index * (width + GAP) + width / 2
+        _text(draw, (middle, head), name, TEXT_SIZE, bold=True, anchor="ma")
+    for index, (row, images) in enumerate(zip(rows, pictures, strict=True)):
+        _draw_row(sheet, top + index * row_height, row, images)
+    _draw_table(draw, below, table)
+    _text(draw, (MARGIN, note_top), note, CAPTION_SIZE, colour=QUIET)
+    pixels = np.asarray(sheet)
+    write_png(path, pixels)
+    return pixels
+
+
+def _caption_height(rows: Sequence[Row]) -> int:
+    lines = max((len(text.split("\n")) for row in rows for text in row.captions), default=0)
+    return lines * _line(CAPTION_SIZE) + 6 if lines else 0
+
+
+def _display(image: NDArray, name: str, exposure: float, shoulder: float) -> NDArray[np.uint8]:
+    array = np.asarray(image)
+    if array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3:
+        return array
+    linear = as_image(array, f"contact sheet, row {name!r}")
+    return to_8bit(tonemap(linear, exposure=exposure, shoulder=shoulder))
+
+
+def _common_size(pictures: list[list[NDArray[np.uint8]]], columns: Sequence[str]) -> tuple[int, int]:
+    if not pictures or not columns:
+        raise ImageError("contact_sheet: no pictures; pass at least one row and one column")
+    if any(len(row) != len(columns) for row in pictures):
+        counts = ", ".join(str(len(row)) for row in pictures)
+        raise ImageError(f"contact_sheet: {len(columns)} columns, but the rows hold {counts} images")
+    sizes = {image.shape[:2] for row in pictures for image in row}
+    if len(sizes) > 1:
+        raise ImageError(f"contact_sheet: images of different sizes {sorted(sizes)}; render all at one size")
+    return sizes.pop()
+
+
+def _draw_row(sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]]) -> None:
+    """The row's label, its images side by side, and a caption under each."""
+    draw = ImageDraw.Draw(sheet)
+    _text(draw, (MARGIN, top), row.label, TEXT_SIZE)
+    top += _line(TEXT_SIZE) + 4
+    for index, image in enumerate(images):
+        left = MARGIN + index * (image.shape[1] + GAP)
+        sheet.paste(Image.fromarray(image), (left, int(top)))
+        if index < len(row.captions):
+            _text(draw, (left, top + image.shape[0] + 4), row.captions[index], CAPTION_SIZE, colour=QUIET)
+
+
+def _draw_table(draw: ImageDraw.ImageDraw, top: float, table: Sequence[Sequence[str]]) -> None:
+    """Cells under a bold heading: the first column to the left, numbers to the right of their columns."""
+    if not table:
+        return
+    left, widths = MARGIN, _column_widths(table)
+    right = left + _table_width(table)
+    for index, cells in enumerate(table):
+        y = top + index * (_line(TEXT_SIZE) + 4)
+        x = float(left)
+        for column, (cell, width) in enumerate(zip(cells, widths, strict=True)):
+            anchor, at = ("la", x) if column == 0 else ("ra", x + width)
+            _text(draw, (at, y), cell, TEXT_SIZE, bold=index == 0, anchor=anchor)
+            x += width + 2 * GAP
+        draw.line([(left, y + _line(TEXT_SIZE)), (right, y + _line(TEXT_SIZE))], fill=RULE)
+
+
+def _column_widths(table: Sequence[Sequence[str]]) -> list[int]:
+    return [max(_width(cell, TEXT_SIZE, bold=True) for cell in column) for column in zip(*table, strict=True)]
+
+
+def _table_width(table: Sequence[Sequence[str]]) -> int:
+    return sum(_column_widths(table)) + 2 * GAP * (len(table[0]) - 1) if table else 0
+
+
+def _table_height(table: Sequence[Sequence[str]]) -> int:
+    return len(table) * (_line(TEXT_SIZE) + 4)
+
+
+def _text(
+    draw: ImageDraw.ImageDraw,
+    at: tuple[float, float],
+    text: str,
+    size: int,
+    *,
+    bold: bool = False,
+    colour: tuple[int, int, int] = INK,
+    anchor: str = "la",
+) -> None:
+    x, y = at
+    for index, line in enumerate(text.split("\n")):
+        draw.text((x, y + index * _line(size)), line, font=_font(size, bold), fill=colour, anchor=anchor)
+
+
+def _line(size: int) -> int:
+    return round(1.35 * size)
+
+
+def _width(text: str, size: int, *, bold: bool = False) -> int:
+    return max(round(_font(size, bold).getlength(line)) for line in text.split("\n"))
+
+
+@lru_cache(maxsize=16)
+def _font(size: int, bold: bool) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which matplotlib brings along on every system."""
+    import matplotlib
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)

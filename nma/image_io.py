@@ -1,0 +1,125 @@
+"""Images on disk: EXR for linear values, PNG for looking at. Every write is atomic: a temporary file, then a rename."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nma.errors import NmaError
+
+
+class ImageError(NmaError, ValueError):
+    """An image cannot be read or written, has the wrong shape, or holds values that are not finite."""
+
+
+def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
+    """Check an image: (height, width, 3), finite.
+
+    Raises:
+        ImageError: another shape, NaN or infinity; the message counts them and names the first pixel.
+    """
+    array = np.asarray(image, dtype=np.float32)
+    if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
+        raise ImageError(f"{name}: shape {array.shape} is not (height, width, 3); pass linear RGB")
+    bad = ~np.isfinite(array).all(axis=2)
+    if bad.any():
+        y, x = np.argwhere(bad)[0]
+        raise ImageError(
+            f"{name}: {bad.sum()} of {bad.size} pixels are NaN or infinite, the first at x={x}, y={y}"
+        )
+    return array
+
+
+def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -> NDArray[np.float32]:
+    """Linear sRGB radiance to display values in 0..1.
+
+    With x = 2^exposure * radiance: values up to `shoulder` stay as they are, values above it approach 1 as
+    s + (1 - s) (1 - exp(-(x - s) / (1 - s))), which has the same slope at s; then the sRGB transfer curve
+    (IEC 61966-2-1). Each channel on its own, so very bright colours turn white. `shoulder` = 1 clips, as metrics want.
+
+    Args:
+        image: (..., 3) linear sRGB, any value; negative values become 0.
+        exposure: stops, a factor 2^exposure.
+        shoulder: linear value in (0, 1] where compression starts.
+    """
+    if not 0.0 < shoulder <= 1.0:
+        raise ImageError(f"tonemap: shoulder {shoulder} must lie in (0, 1]")
+    x = np.maximum(np.asarray(image, dtype=np.float32) * np.float32(2.0**exposure), 0.0)
+    if shoulder < 1.0:
+        room = 1.0 - shoulder
+        x = np.where(x > shoulder, 1.0 - room * np.exp(-np.maximum(x - shoulder, 0.0) / room), x)
+    x = np.clip(x, 0.0, 1.0)
+    curve = 1.055 * np.power(np.maximum(x, 1e-8), 1.0 / 2.4) - 0.055
+    return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)
+
+
+def to_8bit(display: ArrayLike) -> NDArray[np.uint8]:
+    """Display values in 0..1 to bytes, rounded."""
+    return (np.clip(np.asarray(display, dtype=np.float32), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 0.8) -> Path:
+    """Tone-map a linear image (height, width, 3) and write it as an 8-bit sRGB PNG. Bytes are written as they are.
+
+    Raises:
+        ImageError: a wrong shape, or values that are not finite.
+    """
+    from PIL import Image
+
+    array = np.asarray(image)
+    if array.dtype != np.uint8:
+        array = to_8bit(tonemap(as_image(array, str(path)), exposure=exposure, shoulder=shoulder))
+    return _write_atomically(path, lambda temporary: Image.fromarray(array).save(temporary, format="PNG"))
+
+
+def write_exr(path: str | Path, image: ArrayLike) -> Path:
+    """Write linear values (height, width), (height, width, 1) or (height, width, 3) as a 32-bit float EXR.
+
+    Values that are not finite are kept: an EXR is also for looking into what went wrong.
+    """
+    import mitsuba as mi
+
+    array = np.ascontiguousarray(image, dtype=np.float32)
+    if array.ndim not in (2, 3) or 0 in array.shape:
+        raise ImageError(f"{path}: cannot write an array of shape {array.shape} as an image")
+    return _write_atomically(path, lambda temporary: mi.Bitmap(array).write(str(temporary)))
+
+
+def read_image(path: str | Path) -> NDArray[np.float32]:
+    """Read EXR, HDR or PFM (linear as stored) or PNG and JPEG (sRGB, made linear) as (height, width, 3) float32.
+
+    Grey images are repeated over RGB, alpha is dropped.
+
+    Raises:
+        ImageError: the file does not exist or cannot be decoded.
+    """
+    import mitsuba as mi
+
+    if not Path(path).is_file():
+        raise ImageError(f"image {path} does not exist")
+    try:
+        bitmap = mi.Bitmap(str(path))
+        return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
+    except RuntimeError as error:
+        raise ImageError(f"image {path} cannot be read: {error}") from error
+
+
+def _write_atomically(path: str | Path, write: Callable[[Path], object]) -> Path:
+    """Run `write` on a temporary file in the target's folder, then rename it; nothing is left behind on failure."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        temporary.chmod(0o644)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target

@@ -1,0 +1,159 @@
+"""How far a rendered image is from its reference: numbers here, sheets of pictures in `nma.contact_sheet`.
+
+With a the test and b the reference, linear sRGB, means over pixels and channels, fractions rather than percent:
+
+    l1     |a - b|                              l2     (a - b)^2
+    mape   |a - b| / (|b| + eps)                smape  2 |a - b| / (|a| + |b| + eps)
+    mrse   (a - b)^2 / (b^2 + eps)              eps = 0.01
+    ssim   Wang et al. 2004 on display values: Gaussian window, sigma 1.5, K1 = .01, K2 = .03, range 1 (scikit-image)
+    flip_ldr   mean FLIP of Andersson et al. 2020 on display values, 67 pixels per degree (flip-evaluator)
+    flip_hdr   mean HDR-FLIP of Andersson et al. 2021 on linear values, ACES, exposures chosen from the reference
+
+Display values are `nma.image_io.tonemap` at `ldr_exposure` with plain clipping. Equal images give ssim 1, all else 0.
+SSIM and FLIP come from the extra `compare`.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nma.errors import MissingDependencyError
+from nma.image_io import ImageError, as_image, tonemap
+
+Image = NDArray[np.float32]
+EPS = 0.01
+METRICS = ("l1", "l2", "mape", "smape", "mrse", "ssim", "flip_hdr", "flip_ldr")
+
+
+def compare_images(
+    test: ArrayLike, reference: ArrayLike, *, ldr_exposure: float = 0.0, eps: float = EPS
+) -> dict[str, float]:
+    """All metrics of a test image against its reference.
+
+    Args:
+        test, reference: (height, width, 3) linear sRGB, the same shape, finite, at least 11 x 11 for ssim's window.
+        ldr_exposure: stops applied before ssim and flip_ldr.
+        eps: regularisation of mape, smape and mrse.
+
+    Returns:
+        One number for each name in `METRICS`, in that order.
+
+    Raises:
+        ImageError: different shapes, too small an image, NaN or infinity.
+    """
+    a, b = _pair(test, reference)
+    if min(a.shape[:2]) < 11:
+        raise ImageError(
+            f"images of {a.shape[1]} x {a.shape[0]} pixels are too small for ssim; it needs 11 x 11"
+        )
+    error = errors(a, b, eps=eps)
+    error["ssim"] = _ssim(tonemap(a, exposure=ldr_exposure), tonemap(b, exposure=ldr_exposure))
+    error["flip_hdr"] = float(flip_map(a, b, hdr=True).mean(dtype=np.float64))
+    error["flip_ldr"] = float(flip_map(a, b, exposure=ldr_exposure).mean(dtype=np.float64))
+    return {name: error[name] for name in METRICS}
+
+
+def errors(test: ArrayLike, reference: ArrayLike, *, eps: float = EPS) -> dict[str, float]:
+    """The five plain errors l1, l2, mape, smape and mrse, in double precision; see the top of the module."""
+    a, b = (image.astype(np.float64) for image in _pair(test, reference))
+    difference = np.abs(a - b)
+    return {
+        "l1": float(difference.mean()),
+        "l2": float((difference**2).mean()),
+        "mape": float((difference / (np.abs(b) + eps)).mean()),
+        "smape": float((2.0 * difference / (np.abs(a) + np.abs(b) + eps)).mean()),
+        "mrse": float((difference**2 / (b**2 + eps)).mean()),
+    }
+
+
+def flip_map(test: ArrayLike, reference: ArrayLike, *, hdr: bool = False, exposure: float = 0.0) -> Image:
+    """FLIP error of each pixel, (height, width) in 0..1.
+
+    Args:
+        test, reference: (height, width, 3) linear sRGB; negative values count as 0.
+        hdr: HDR-FLIP, the worst over a range of exposures that the reference sets; otherwise LDR-FLIP.
+        exposure: stops, for LDR-FLIP only.
+    """
+    flip_evaluator = _library("flip_evaluator")
+    a, b = _pair(test, reference)
+    if hdr:
+        a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
+        settings = {"dynamicRangeString": "HDR", "parameters": _exposures(b)}
+    else:
+        a, b = tonemap(a, exposure=exposure), tonemap(b, exposure=exposure)
+        settings = {"dynamicRangeString": "LDR", "parameters": {}}
+    error, _, _ = flip_evaluator.evaluate(b, a, applyMagma=False, computeMeanError=False, **settings)
+    return np.asarray(error, dtype=np.float32).reshape(b.shape[:2])
+
+
+def difference_image(
+    test: ArrayLike, reference: ArrayLike, *, kind: str = "flip", scale: float = 1.0, exposure: float = 0.0
+) -> NDArray[np.uint8]:
+    """A picture of where two images differ, (height, width, 3) bytes, ready for a PNG.
+
+    Args:
+        test, reference: (height, width, 3) linear sRGB.
+        kind: "flip", LDR-FLIP in the colours of magma (black 0, pale yellow 1); "absolute", mean |a - b| over the
+            channels in magma; "signed", mean a - b over the channels, blue where the test is darker, else red.
+        scale: the difference that takes the last colour.
+        exposure: stops, for "flip".
+
+    Raises:
+        ImageError: unknown kind, different shapes, NaN or infinity.
+    """
+    from matplotlib import colormaps
+
+    a, b = _pair(test, reference)
+    if kind == "flip":
+        colours = colormaps["magma"](np.clip(flip_map(a, b, exposure=exposure) / scale, 0.0, 1.0))
+    elif kind == "absolute":
+        colours = colormaps["magma"](np.clip(np.abs(a - b).mean(axis=2) / scale, 0.0, 1.0))
+    elif kind == "signed":
+        colours = colormaps["RdBu_r"](np.clip(0.5 + 0.5 * (a - b).mean(axis=2) / scale, 0.0, 1.0))
+    else:
+        raise ImageError(f"difference_image: unknown kind {kind!r}; take flip, absolute or signed")
+    return (colours[..., :3] * 255.0 + 0.5).astype(np.uint8)
+
+
+def _pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
+    a, b = as_image(test, "test image"), as_image(reference, "reference image")
+    if a.shape != b.shape:
+        sizes = " and ".join(f"{image.shape[1]} x {image.shape[0]}" for image in (a, b))
+        raise ImageError(f"test and reference differ in size: {sizes} pixels; render both at the same size")
+    return a, b
+
+
+def _library(name: str) -> Any:
+    """A library of the extra `compare`.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            f"comparing images needs {error.name}; run: pip install 'neural-material-adapter[compare]'"
+        ) from error
+
+
+def _ssim(a: Image, b: Image) -> float:
+    settings: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(
+        _library("skimage.metrics").structural_similarity(a, b, channel_axis=-1, data_range=1.0, **settings)
+    )
+
+
+def _exposures(reference: Image) -> dict[str, float]:
+    """Nothing for ordinary references. For black or flat ones, where the library ends the process, one exposure."""
+    luminance = reference @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    brightest, middle = float(luminance.max()), float(np.median(luminance))
+    if brightest > 1e-4 and brightest > 1.001 * middle:
+        return {}
+    exposure = -math.log2(brightest) if brightest > 1e-4 else 0.0
+    return {"startExposure": exposure, "stopExposure": exposure}

@@ -1,0 +1,185 @@
+"""Image files, tone mapping, metrics, difference pictures and contact sheets."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nma import image_io
+from nma.contact_sheet import Row, contact_sheet
+from nma.errors import MissingDependencyError
+from nma.image_io import ImageError, read_image, tonemap, write_exr, write_png
+from nma.image_metrics import METRICS, compare_images, difference_image, errors, flip_map
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    """A smooth picture with a range of 0.02 to about 4."""
+    x, y = np.meshgrid(np.linspace(0.0, 1.0, 48), np.linspace(0.0, 1.0, 32))
+    return np.stack([0.02 + x, 0.02 + y * y, 0.02 + 4.0 * x * y], axis=-1).astype(np.float32)
+
+
+def test_equal_images_have_no_error(picture):
+    result = compare_images(picture, picture)
+    assert tuple(result) == METRICS
+    assert result.pop("ssim") == pytest.approx(1.0, abs=1e-6)
+    assert result == dict.fromkeys(result, pytest.approx(0.0, abs=1e-6))
+
+
+def test_plain_errors_follow_their_formulas():
+    """One pixel pair a = 3, b = 1 in every channel, eps = .01."""
+    result = errors(np.full((2, 2, 3), 3.0), np.full((2, 2, 3), 1.0))
+    expected = {"l1": 2.0, "l2": 4.0, "mape": 2 / 1.01, "smape": 4 / 4.01, "mrse": 4 / 1.01}
+    assert result == pytest.approx(expected, rel=1e-9)
+
+
+def test_errors_grow_with_the_difference(picture):
+    """SSIM is left out: it ignores most of a change of brightness."""
+    small, large = (compare_images(picture * factor, picture) for factor in (1.05, 1.3))
+    assert all(large[name] > small[name] > 0.0 for name in METRICS if name != "ssim")
+
+
+def test_structure_is_what_ssim_sees(picture):
+    noise = 0.2 * np.random.default_rng(0).normal(size=picture.shape)
+    assert (
+        compare_images(picture + noise, picture)["ssim"]
+        < 0.8
+        < compare_images(picture * 1.05, picture)["ssim"]
+    )
+
+
+def test_exposure_decides_what_ldr_metrics_see(picture):
+    """A difference beyond white shows after lowering the exposure."""
+    bright = picture + 2.0
+    clipped = compare_images(bright * 1.2, bright)
+    lowered = compare_images(bright * 1.2, bright, ldr_exposure=-4.0)
+    assert clipped["flip_ldr"] < 1e-6
+    assert lowered["flip_ldr"] > 0.02
+    assert clipped["flip_hdr"] == lowered["flip_hdr"] > 0.02
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3, 20.0])
+def test_flip_survives_black_and_flat_references(level):
+    reference = np.full((12, 12, 3), level, dtype=np.float32)
+    assert flip_map(reference, reference, hdr=True).max() == pytest.approx(0.0, abs=1e-6)
+    assert flip_map(reference + 0.5 * level + 0.5, reference, hdr=True).mean() > 0.05
+
+
+def test_negative_values_count_as_black(picture):
+    assert np.isfinite(list(compare_images(picture - 0.2, picture).values())).all()
+
+
+@pytest.mark.parametrize("call", [compare_images, errors, flip_map, difference_image])
+def test_unfit_images_are_refused(call, picture):
+    broken = picture.copy()
+    broken[3, 5] = np.nan
+    with pytest.raises(ImageError, match="x=5, y=3"):
+        call(broken, picture)
+    with pytest.raises(ImageError, match="47 x 32 and 48 x 32"):
+        call(picture[:, 1:], picture)
+    with pytest.raises(ImageError, match="reference image"):
+        call(picture, picture[..., 0])
+
+
+def test_too_small_images_are_refused_for_ssim():
+    with pytest.raises(ImageError, match="11 x 11"):
+        compare_images(np.ones((8, 8, 3)), np.ones((8, 8, 3)))
+
+
+def test_missing_library_names_the_extra(picture, monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(MissingDependencyError, match=r"neural-material-adapter\[compare\]"):
+        flip_map(picture, picture)
+
+
+def test_difference_pictures(picture):
+    brighter = picture + 0.1
+    none, signed = difference_image(picture, picture), difference_image(brighter, picture, kind="signed")
+    assert none.shape == picture.shape and none.dtype == np.uint8
+    assert none.max() <= 4  # magma starts almost black
+    assert (signed[..., 0] > signed[..., 2]).all()
+    assert difference_image(brighter, picture, kind="absolute", scale=0.1).mean() > 150
+    with pytest.raises(ImageError, match="unknown kind"):
+        difference_image(picture, picture, kind="relative")
+
+
+def test_tonemap_is_srgb():
+    """Known pairs of the transfer curve; a stop doubles; clipping at both ends."""
+    linear = np.array([-1.0, 0.0, 0.001, 0.18, 0.5, 1.0, 9.0])
+    expected = np.array([0.0, 0.0, 0.01292, 0.46135612, 0.73535698, 1.0, 1.0])
+    np.testing.assert_allclose(tonemap(linear), expected, atol=1e-6)
+    np.testing.assert_allclose(tonemap(linear / 2.0, exposure=1.0), expected, atol=1e-6)
+
+
+def test_shoulder_is_smooth_and_keeps_what_lies_below():
+    x = np.linspace(0.0, 3.0, 3001)
+    plain, soft = tonemap(x), tonemap(x, shoulder=0.8)
+    np.testing.assert_array_equal(soft[x <= 0.8], plain[x <= 0.8])
+    assert (np.diff(soft) >= 0.0).all() and soft.max() <= 1.0
+    slope = np.diff(soft) / np.diff(x)
+    assert np.abs(np.diff(slope)[790:810]).max() < 0.01
+    with pytest.raises(ImageError):
+        tonemap(x, shoulder=0.0)
+
+
+def test_exr_keeps_values(tmp_path: Path, picture):
+    np.testing.assert_array_equal(
+        read_image(write_exr(tmp_path / "new" / "a.exr", picture * 100.0)), picture * 100.0
+    )
+
+
+def test_png_holds_the_tonemapped_picture(tmp_path: Path, picture):
+    path = write_png(tmp_path / "a.png", picture, exposure=-1.0, shoulder=1.0)
+    shown = np.asarray(Image.open(path))
+    np.testing.assert_array_equal(shown, image_io.to_8bit(tonemap(picture, exposure=-1.0)))
+    np.testing.assert_allclose(read_image(path), np.minimum(picture / 2.0, 1.0), atol=0.01)
+
+
+def test_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path, picture, monkeypatch):
+    path = write_png(tmp_path / "a.png", picture)
+    before = path.read_bytes()
+
+    def fail(*_args, **_options):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Image.Image, "save", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_png(path, picture * 2.0)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unreadable_images_are_refused(tmp_path: Path, picture):
+    with pytest.raises(ImageError, match="does not exist"):
+        read_image(tmp_path / "none.exr")
+    (tmp_path / "bad.exr").write_bytes(b"not an image")
+    with pytest.raises(ImageError, match="cannot be read"):
+        read_image(tmp_path / "bad.exr")
+    with pytest.raises(ImageError, match="NaN"):
+        write_png(tmp_path / "nan.png", picture * np.nan)
+
+
+def test_contact_sheet_shows_the_pictures(tmp_path: Path, picture):
+    bytes_ = image_io.to_8bit(tonemap(picture, shoulder=0.8))
+    rows = [Row("first", [picture, bytes_], ["2.1 s\nvariance .01"]), Row("second", [picture, picture])]
+    sheet = contact_sheet(
+        tmp_path / "a.png", rows, ["Left", "Right"], title="Title", table=[["", "a"], ["x", "1"]], note="note"
+    )
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), sheet)
+    corners = np.argwhere((sheet == bytes_[0, 0]).all(axis=2))
+    height, width = bytes_.shape[:2]
+    found = sum(np.array_equal(sheet[y : y + height, x : x + width], bytes_) for y, x in corners)
+    assert found == 4
+
+
+@pytest.mark.parametrize("fault", ["empty", "count", "size"])
+def test_contact_sheet_refuses(fault, tmp_path: Path, picture):
+    rows = {
+        "empty": [],
+        "count": [Row("r", [picture])],
+        "size": [Row("r", [picture, picture[1:]])],
+    }[fault]
+    with pytest.raises(ImageError):
+        contact_sheet(tmp_path / "a.png", rows, ["one", "two"])
