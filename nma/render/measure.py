@@ -1,0 +1,174 @@
+"""Time and noise of a rendering, over independent seeds; and a test whether two renderings have the same mean."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nma.errors import ParamError
+from nma.image_io import ImageError
+
+Array = NDArray[np.float64]
+
+
+class Measurement(NamedTuple):
+    """What several runs of one rendering say.
+
+    `mean`, `variance`: (height, width, 3) float64; the unbiased variance of ONE run of `spp` samples, not of the mean.
+    `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`: median wall time of a run.
+    `compile_seconds`: what the first frame took beyond that; 0 without warm-up. `times`: each run's seconds.
+    """
+
+    mean: Array
+    variance: Array
+    runs: int
+    spp: int
+    seconds: float
+    compile_seconds: float
+    times: tuple[float, ...]
+
+    @property
+    def mean_variance(self) -> float:
+        """The variance of one run, averaged over pixels and channels."""
+        return float(self.variance.mean())
+
+    @property
+    def efficiency(self) -> float:
+        """1 / (variance * seconds), the usual Monte Carlo efficiency."""
+        return 1.0 / max(self.mean_variance * self.seconds, 1e-300)
+
+
+class Agreement(NamedTuple):
+    """Result of `zscore_images`.
+
+    `p_values`: two-sided, one for each tested block and channel. `level`: a p-value below it rejects, after Sidak's
+    correction. `passed`: none does. `worst`: (row, column, channel) of the smallest p-value, in blocks.
+    """
+
+    p_values: Array
+    level: float
+    passed: bool
+    worst: tuple[int, int, int]
+
+
+def measure(
+    scene: Any, spp: int, seeds: int | Iterable[int] = 5, *, warmup: bool = True, **render_options: Any
+) -> Measurement:
+    """Render a loaded scene once for each seed; every run is evaluated to its end before the clock stops.
+
+    Args:
+        scene: what `mi.load_dict` returned.
+        spp: samples per pixel of each run.
+        seeds: how many, 0 to n - 1, or the seeds themselves; all different, at least 2.
+        warmup: render once before, with another seed, so that no run pays for compilation.
+        render_options: passed to `mi.render`, such as `sensor` or `integrator`.
+
+    Raises:
+        ParamError: fewer than two seeds, or a seed twice.
+    """
+    numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
+    if len(numbers) < 2 or len(set(numbers)) < len(numbers):
+        raise ParamError(f"measure: seeds {numbers} must be at least two different ones, or their number")
+    first = render_seconds(scene, spp, max(numbers) + 1, **render_options)[1] if warmup else 0.0
+
+    # Welford's update keeps one mean and one sum of squares, whatever the number of runs.
+    times, mean, squares = [], np.zeros(()), np.zeros(())
+    for count, seed in enumerate(numbers, start=1):
+        image, seconds = render_seconds(scene, spp, seed, **render_options)
+        delta = image - mean
+        mean = mean + delta / count
+        squares = squares + delta * (image - mean)
+        times.append(seconds)
+    median = float(np.median(times))
+    extra = max(first - median, 0.0)
+    return Measurement(mean, squares / (len(numbers) - 1), len(numbers), spp, median, extra, tuple(times))
+
+
+def render_seconds(scene: Any, spp: int, seed: int, **render_options: Any) -> tuple[Array, float]:
+    """One rendering as float64 (height, width, channels), and its wall time in seconds until the kernels have run."""
+    import drjit as dr
+    import mitsuba as mi
+
+    dr.sync_thread()
+    start = time.perf_counter()
+    image = mi.render(scene, spp=spp, seed=seed, **render_options)  # type: ignore[arg-type]
+    dr.eval(image)
+    dr.sync_thread()
+    seconds = time.perf_counter() - start
+    return np.array(image, dtype=np.float64), seconds
+
+
+def zscore_images(
+    mean_a: ArrayLike,
+    variance_a: ArrayLike,
+    runs_a: int,
+    mean_b: ArrayLike,
+    variance_b: ArrayLike,
+    runs_b: int,
+    *,
+    false_alarm: float = 0.01,
+    block: int = 1,
+    rounding: float = 1e-5,
+) -> Agreement:
+    """Test whether two renderings have the same expectation everywhere, pixel by pixel and channel by channel.
+
+    A Z-test with estimated variances, that is Welch's t-test (Jung, Hanika and Dachsbacher 2020), whose degrees of
+    freedom come from Welch and Satterthwaite; with many runs it is the normal test. The level of one test is Sidak's,
+    1 - (1 - false_alarm)^(1/tests), so that equal images fail with about that probability in total. Runs of few samples
+    are far from normal where light is rare, and then alarm too often: prefer few long runs to many short ones there.
+
+    scipy is needed; it comes with the extras `compare` and `train`.
+
+    Args:
+        mean_a, variance_a, runs_a: (height, width, channels) mean and variance of one run over that many runs.
+        mean_b, variance_b, runs_b: the same for the other rendering. `runs` = 1 and variance 0 is an exact image.
+        false_alarm: chance that equal renderings are rejected.
+        block: average squares of this many pixels first. Small differences everywhere then stand out of the noise.
+            Needs independent pixels, as with the box filter. Rows and columns that fill no block are left out.
+        rounding: relative difference that single precision explains; it adds to the standard error.
+
+    Raises:
+        ImageError: different shapes, values that are not finite, a block larger than the image.
+    """
+    from scipy.stats import t as student
+
+    arrays = [np.asarray(array, dtype=np.float64) for array in (mean_a, variance_a, mean_b, variance_b)]
+    if len({array.shape for array in arrays}) > 1 or arrays[0].ndim != 3:
+        raise ImageError(
+            f"zscore_images: shapes {[a.shape for a in arrays]} must be equal, (height, width, channels)"
+        )
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ImageError(
+            "zscore_images: means or variances hold NaN or infinity; look at the image for the pixel"
+        )
+    a, var_a, b, var_b = (_blocks(array, block) for array in arrays)
+
+    # Standard errors of the block means, and how well their estimates are known (Welch and Satterthwaite).
+    pixels = block**2
+    error = var_a / (runs_a * pixels) + var_b / (runs_b * pixels)
+    spread = sum(
+        _blocks(variance**2, block) / (runs**2 * pixels**3 * max(runs - 1, 1))
+        for variance, runs in ((arrays[1], runs_a), (arrays[3], runs_b))
+    )
+    freedom = np.where(spread > 0.0, error**2 / np.maximum(spread, 1e-300), 1e9)
+    error = error + (rounding * np.maximum(np.abs(a), np.abs(b))) ** 2 + 1e-24
+    p_values = 2.0 * student.sf(np.abs(a - b) / np.sqrt(error), freedom)
+    level = -np.expm1(np.log1p(-false_alarm) / p_values.size)
+    worst = np.unravel_index(int(np.argmin(p_values)), p_values.shape)
+    row, column, channel = (int(index) for index in worst)
+    return Agreement(p_values, float(level), bool((p_values >= level).all()), (row, column, channel))
+
+
+def _blocks(image: Array, block: int) -> Array:
+    """Means over block x block pixels."""
+    height, width = (extent // block for extent in image.shape[:2])
+    if height == 0 or width == 0:
+        raise ImageError(
+            f"zscore_images: block {block} is larger than the image, {image.shape[1]} x {image.shape[0]}"
+        )
+    cut = image[: height * block, : width * block]
+    return cut.reshape(height, block, width, block, -1).mean(axis=(1, 3))

@@ -1,0 +1,230 @@
+"""A shader ball made by code: an open shell with a groove, a small ball inside it, and the ring it stands on.
+
+Every part is a solid of revolution, so texture coordinates follow from the construction: u runs around the axis, v
+along the profile. The axes point so that no pole, where u shrinks to a point, faces the default camera.
+
+Units: the shell's outer radius is 1. The ring stands on the plane z = 0, z is up.
+"""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SHELL_CENTRE = np.array([0.0, 0.0, 1.12])
+SHELL_AXIS = np.array([0.56, -0.66, 0.50])  # the opening looks along this direction
+SHELL_OPENING = np.radians(52.0)  # polar angle of the lip's top
+LIP_RADIUS = 0.07
+CAVITY_OFFSET = 0.16  # the cavity is part of a sphere whose centre lies this far along the axis
+GROOVE_ANGLE = np.radians(76.0)
+GROOVE_HALF_WIDTH = np.radians(3.6)
+GROOVE_DEPTH = 0.055
+CORE_RADIUS = 0.41
+CORE_AXIS = np.array([-0.75, 0.45, 0.35])
+RING_RADII = (0.44, 0.74)
+RING_HEIGHT = 0.215
+TEXELS_PER_TURN = 2  # a texture repeats this often around the shell
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh: vertices (n, 3), unit normals (n, 3), texture coordinates (n, 2), faces (m, 3)."""
+
+    vertices: Array
+    normals: Array
+    uv: Array
+    faces: NDArray[np.int32]
+
+
+def shader_ball(detail: float = 1.0) -> Mesh:
+    """The whole shader ball as one mesh.
+
+    Args:
+        detail: factor on the number of segments in both directions; 1 gives about 54,000 triangles.
+
+    Returns:
+        A closed, outward-facing mesh with smooth normals; u and v repeat with period 1.
+    """
+    shell = revolve(
+        _shell_profile(), round(200 * detail), round(100 * detail), SHELL_AXIS, repeats=TEXELS_PER_TURN
+    )
+    core = revolve(
+        _arc(CORE_RADIUS, 0.0, np.pi), round(64 * detail), round(36 * detail), CORE_AXIS, repeats=1
+    )
+    ring = revolve(
+        _ring_profile(), round(96 * detail), round(48 * detail), np.array([0.0, 0.0, 1.0]), repeats=2
+    )
+    return _merge([_translate(shell, SHELL_CENTRE), _translate(core, _core_centre()), ring])
+
+
+def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int) -> Mesh:
+    """Turn a profile around an axis through the origin.
+
+    Args:
+        profile: (n, 2) points (radius, height), dense; the surface lies to the left of the direction of travel.
+        turns: segments around the axis.
+        steps: segments along the profile, spread evenly over its length and its turning.
+        axis: direction of the height, any length.
+        repeats: how often u runs from 0 to 1 in one turn; v is scaled to match at the largest radius.
+
+    Returns:
+        The mesh, with normals from the profile's tangent.
+    """
+    radius, height, normal, length = _resample(profile, steps)
+    phi = np.linspace(0.0, 2.0 * np.pi, turns + 1)
+    frame = _frame(axis)
+    ring = np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+
+    def place(r: Array, z: Array) -> Array:
+        local = np.concatenate(
+            [r[:, None, None] * ring, np.broadcast_to(z[:, None, None], (len(r), turns + 1, 1))], -1
+        )
+        return (local @ frame).reshape(-1, 3)
+
+    v_scale = repeats / (2.0 * np.pi * radius.max())
+    u, v = np.meshgrid(repeats * phi / (2.0 * np.pi), v_scale * length)
+    uv = np.stack([u, v], axis=-1).reshape(-1, 2)
+    faces = _grid_faces(len(radius), turns + 1, radius)
+    return Mesh(place(radius, height), place(normal[:, 0], normal[:, 1]), uv, faces)
+
+
+@lru_cache(maxsize=4)
+def shader_ball_file(detail: float = 1.0) -> Path:
+    """Path of the shader ball as a binary PLY file in this process's temporary folder, written on the first call."""
+    path = _scratch_folder() / f"shaderball-{detail:g}.ply"
+    write_ply(path, shader_ball(detail))
+    return path
+
+
+def write_ply(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as little-endian binary PLY, with normals and texture coordinates."""
+    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
+    face = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    face["count"], face["index"] = 3, mesh.faces
+    vertex = np.concatenate([mesh.vertices, mesh.normals, mesh.uv], axis=1).astype("<f4")
+    path.write_bytes("\n".join([*header, ""]).encode() + vertex.tobytes() + face.tobytes())
+
+
+@lru_cache(maxsize=1)
+def _scratch_folder() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="nma-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _arc(radius: float | Array, start: float, stop: float, count: int = 2000) -> Array:
+    """Points at polar angles from start to stop; `radius` may vary along the arc."""
+    theta = np.linspace(start, stop, count)
+    return np.stack([radius * np.sin(theta), radius * np.cos(theta)], axis=-1)
+
+
+def _cavity() -> tuple[Array, float]:
+    """The middle of the lip's rounding (radius, height), and the radius of the cavity that touches it smoothly."""
+    middle = (1.0 - LIP_RADIUS) * np.array([np.sin(SHELL_OPENING), np.cos(SHELL_OPENING)])
+    return middle, float(np.hypot(middle[0], middle[1] - CAVITY_OFFSET) - LIP_RADIUS)
+
+
+def _core_centre() -> Array:
+    """The small ball lies where gravity takes it: at the lowest point of the cavity."""
+    down = np.array([0.0, 0.0, CORE_RADIUS - _cavity()[1]])
+    return SHELL_CENTRE + CAVITY_OFFSET * SHELL_AXIS / np.linalg.norm(SHELL_AXIS) + down
+
+
+def _shell_profile() -> Array:
+    """From the pole of the cavity over the lip, down the outside with its groove, to the outer pole."""
+    middle, radius = _cavity()
+    rim = np.arctan2(middle[0], middle[1] - CAVITY_OFFSET)
+    inside = _arc(radius, np.pi, rim) + np.array([0.0, CAVITY_OFFSET])
+
+    # The lip turns from the direction of the cavity's centre to the outward direction of the shell.
+    turn = np.linspace(rim - np.pi, SHELL_OPENING, 400)
+    lip = middle + LIP_RADIUS * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
+
+    theta = np.linspace(SHELL_OPENING, np.pi, 6000)
+    across = np.clip(np.abs(theta - GROOVE_ANGLE) / GROOVE_HALF_WIDTH, 0.0, 1.0)
+    outside = _arc(1.0 - GROOVE_DEPTH * (0.5 + 0.5 * np.cos(np.pi * across)), SHELL_OPENING, np.pi, 6000)
+    return np.concatenate([inside[:-1], lip[:-1], outside])
+
+
+def _ring_profile() -> Array:
+    """A rounded ring: a rectangle with quarter circles at its four corners, closed, seen from outside."""
+    inner, outer = RING_RADII
+    corner = 0.07
+    angle = np.linspace(0.0, np.pi / 2.0, 200)
+    corners = [
+        (inner + corner, RING_HEIGHT - corner, np.pi),
+        (outer - corner, RING_HEIGHT - corner, np.pi / 2.0),
+        (outer - corner, corner, 0.0),
+        (inner + corner, corner, -np.pi / 2.0),
+    ]
+    arcs = [
+        np.stack([r + corner * np.cos(a - angle), z + corner * np.sin(a - angle)], -1) for r, z, a in corners
+    ]
+    points = np.concatenate([*arcs, arcs[0][:1]])
+
+    # Fill the straight pieces, so that every piece of the polygon is short.
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    fine = np.union1d(along, np.linspace(0.0, along[-1], 2000))
+    return np.stack([np.interp(fine, along, points[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
+    """Radius, height, outward normal (n, 2) and arc length at steps + 1 places, denser where the profile turns."""
+    delta = np.diff(profile, axis=0)
+    piece = np.linalg.norm(delta, axis=1)
+    delta, start, piece = delta[piece > 1e-9], profile[:-1][piece > 1e-9], piece[piece > 1e-9]
+    points = np.concatenate([start, profile[-1:]])
+    length = np.concatenate([[0.0], np.cumsum(piece)])
+
+    # Angles at the middles of the pieces, interpolated to their ends; a closed profile wraps around.
+    angle = np.unwrap(np.arctan2(delta[:, 1], delta[:, 0]))
+    middles = (length[:-1] + length[1:]) / 2.0
+    at_points = np.interp(length, middles, angle)
+    density = piece / length[-1] + 1.5 * np.abs(np.diff(at_points)) / np.abs(np.diff(at_points)).sum()
+
+    progress = np.concatenate([[0.0], np.cumsum(density)])
+    where = np.interp(np.linspace(0.0, progress[-1], steps + 1), progress, length)
+    radius, height = (np.interp(where, length, points[:, axis]) for axis in (0, 1))
+    tangent = np.interp(where, length, at_points)
+    return np.maximum(radius, 0.0), height, np.stack([-np.sin(tangent), np.cos(tangent)], -1), where
+
+
+def _grid_faces(rows: int, columns: int, radius: Array) -> NDArray[np.int32]:
+    """Two triangles for each cell of a grid of vertices, leaving out those without area at a pole."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    lower, upper = np.stack([a, d, c], -1), np.stack([a, c, b], -1)
+    keep_lower, keep_upper = radius[1:] > 1e-9, radius[:-1] > 1e-9
+    return np.concatenate([lower[keep_lower].reshape(-1, 3), upper[keep_upper].reshape(-1, 3)]).astype(
+        np.int32
+    )
+
+
+def _frame(axis: Array) -> Array:
+    """Rows: two directions across the axis, and the axis; a right-handed rotation."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _translate(mesh: Mesh, offset: Array) -> Mesh:
+    return mesh._replace(vertices=mesh.vertices + offset)
+
+
+def _merge(meshes: list[Mesh]) -> Mesh:
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, first, strict=True)]
+    vertices, normals, uv = (np.concatenate([mesh[part] for mesh in meshes]) for part in range(3))
+    return Mesh(vertices, normals, uv, np.concatenate(faces).astype(np.int32))

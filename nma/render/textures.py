@@ -1,0 +1,138 @@
+"""Textures made by code for examples: worn metal, patches of lacquer, marbled pigment. They tile; a seed fixes them.
+
+The values are linear source parameters, not colours on a screen: load them as raw data, as
+`nma.render.scene.bitmap_texture` does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.errors import TextureError
+
+Array = NDArray[np.float64]
+LACQUER = np.array([[0.93, 0.60, 0.14], [0.80, 0.10, 0.06], [0.10, 0.38, 0.42], [0.97, 0.93, 0.84]])
+
+
+def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.float32]]:
+    """Three textures for the class `layered3`, independent patterns of one worn, lacquered object.
+
+    Args:
+        size: width and height in texels, at least 16.
+        seed: another seed gives another object; the same seed gives the same numbers.
+
+    Returns:
+        `alpha_bottom` (size, size) in 1e-3..1: a polished metal with finger prints and scratches;
+        `sigma_t` (size, size) in 0..1: patches where the pigmented medium is worn off, soft at their edges;
+        `albedo` (size, size, 3) in 0..1: marbled pigments.
+
+    Raises:
+        TextureError: a size below 16.
+    """
+    if size < 16:
+        raise TextureError(f"procedural_textures: size {size} is too small; take 16 or more")
+    rng = np.random.default_rng(seed)
+    textures = {
+        "alpha_bottom": _worn_metal(rng, size),
+        "sigma_t": _patches(rng, size),
+        "albedo": _marble(rng, size),
+    }
+    return {name: texture.astype(np.float32) for name, texture in textures.items()}
+
+
+def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope: float = 2.0) -> Array:
+    """Smooth noise that tiles: (size, size), mean 0, standard deviation 1.
+
+    White noise shaped in the frequency domain, where everything repeats by nature: flat up to 1/period, then falling
+    with frequency^-slope. The same seed gives the same pattern at every size.
+
+    Args:
+        period: size of the largest features, as a share of the texture.
+        slope: 1.5 is rough, 3 is smooth.
+    """
+    frequency = np.fft.fftfreq(size, 1.0 / size)
+    radius = np.hypot(*np.meshgrid(frequency, frequency))
+    amplitude = np.where(radius > 0.0, np.maximum(radius * period, 1.0) ** -slope, 0.0)
+    spectrum = _low_frequencies(rng, size) * amplitude
+    noise = np.fft.ifft2(spectrum).real
+    return noise / noise.std()
+
+
+def _low_frequencies(rng: np.random.Generator, size: int, cutoff: int = 64) -> NDArray[np.complex128]:
+    """A (size, size) spectrum of white noise up to `cutoff` cycles, the same numbers for every size that holds them."""
+    block = rng.normal(size=(2, 2 * cutoff + 1, 2 * cutoff + 1))
+    reach = min(cutoff, size // 2 - 1)
+    inner = block[:, cutoff - reach : cutoff + reach + 1, cutoff - reach : cutoff + reach + 1]
+    spectrum = np.zeros((size, size), dtype=np.complex128)
+    index = np.arange(-reach, reach + 1) % size
+    spectrum[np.ix_(index, index)] = inner[0] + 1j * inner[1]
+    return spectrum
+
+
+def _smoothstep(low: float, high: float, x: Array) -> Array:
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _worn_metal(rng: np.random.Generator, size: int) -> Array:
+    """log10(alpha): polished at -1.4, finger prints and scratches rougher, dull clouds roughest."""
+    clouds = periodic_noise(rng, size, period=0.35, slope=2.2)
+    log_alpha = -1.35 + 0.28 * clouds
+    log_alpha += 0.55 * _finger_prints(rng, size)
+    log_alpha = np.maximum(log_alpha, -1.6 + 1.25 * _scratches(rng, size, count=90))
+    return np.clip(10.0**log_alpha, 1e-3, 1.0)
+
+
+def _finger_prints(rng: np.random.Generator, size: int, count: int = 5) -> Array:
+    """Ridges in 0..1: concentric ovals bent by noise, inside soft ovals, placed around the tile."""
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
+    bend = periodic_noise(rng, size, period=0.25, slope=3.0)
+    prints = np.zeros((size, size))
+    for _ in range(count):
+        cx, cy, turn, scale = *rng.uniform(size=2), rng.uniform(0.0, np.pi), rng.uniform(0.085, 0.12)
+
+        # The nearest copy of the centre makes the print cross the border of the tile.
+        dx, dy = (x - cx + 0.5) % 1.0 - 0.5, (y - cy + 0.5) % 1.0 - 0.5
+        along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
+        oval = np.hypot(along / 1.45, across) / scale
+        ridges = 0.5 + 0.5 * np.sin(2.0 * np.pi * (7.0 * oval + 0.55 * bend))
+        prints = np.maximum(prints, ridges * _smoothstep(1.0, 0.7, oval))
+    return prints
+
+
+def _scratches(rng: np.random.Generator, size: int, count: int) -> Array:
+    """Thin straight lines in 0..1 with tapering ends; each is drawn around the border of the tile."""
+    texel = 1.0 / size
+    x, y = np.meshgrid((np.arange(size) + 0.5) * texel, (np.arange(size) + 0.5) * texel)
+    scratches = np.zeros((size, size))
+    for _ in range(count):
+        cx, cy, depth = *rng.uniform(size=2), rng.uniform(0.35, 1.0)
+        turn, half = rng.normal(0.6, 0.5), rng.uniform(0.04, 0.24)
+        width = max(rng.uniform(0.0008, 0.0022), 0.6 * texel)
+        dx, dy = (x - cx + 0.5) % 1.0 - 0.5, (y - cy + 0.5) % 1.0 - 0.5
+        along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
+        line = np.clip(1.5 - np.abs(across) / width, 0.0, 1.0) * _smoothstep(1.0, 0.6, np.abs(along) / half)
+        scratches = np.maximum(scratches, depth * line)
+    return scratches
+
+
+def _patches(rng: np.random.Generator, size: int) -> Array:
+    """Extinction: nearly opaque lacquer, worn through in islands, uneven in thickness."""
+    wear = periodic_noise(rng, size, period=0.30, slope=2.4)
+    thickness = 0.85 + 0.10 * periodic_noise(rng, size, period=0.5, slope=3.0)
+    return np.clip(thickness * _smoothstep(-0.75, -0.35, wear), 0.0, 1.0)
+
+
+def _marble(rng: np.random.Generator, size: int) -> Array:
+    """Pigments in bands that a warped coordinate runs through; the bands close after one tile."""
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
+    warp = 0.16 * periodic_noise(rng, size, period=0.45, slope=3.0) + 0.03 * periodic_noise(
+        rng, size, period=0.15
+    )
+    phase = len(LACQUER) * (x + 2.0 * y + warp)
+    band = np.floor(phase).astype(int) % len(LACQUER)
+    edge = _smoothstep(0.78, 0.94, phase - np.floor(phase))[..., None]
+    colour = (1.0 - edge) * LACQUER[band] + edge * LACQUER[(band + 1) % len(LACQUER)]
+    grain = 1.0 + 0.05 * periodic_noise(rng, size, period=0.05, slope=1.5)[..., None]
+    return np.clip(colour * grain, 0.0, 1.0)
