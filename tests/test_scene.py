@@ -72,9 +72,14 @@ def test_material_covers_forty_percent(name):
 
 
 def test_parameters_keep_their_names():
-    keys = mi.traverse(mi.load_dict(preview_scene(GREY, size=(8, 8)))).keys()
+    keys = mi.traverse(mi.load_dict(preview_scene(GREY | {"id": "mine"}, size=(8, 8)))).keys()
     assert "material.reflectance.value" in keys
-    assert {"sky.data", "lamp.emitter.radiance.value", "ball.vertex_positions"} <= set(keys)
+    assert {
+        "sky.data",
+        "lamp.emitter.radiance.value",
+        "floor.bsdf.reflectance.data",
+        "ball.vertex_positions",
+    } <= set(keys)
 
 
 def test_picture_is_well_exposed():

@@ -1,7 +1,7 @@
 """The material-preview scene: the shader ball on graph paper under sun, sky and one small area light.
 
 Made by code alone, no assets. Everything is a Mitsuba dictionary, so it can be changed before `mi.load_dict`. Names
-that `mi.traverse` shows: `material.*` is the material under test, `floor_material.*` the paper, `sky.*`, `lamp.*`,
+that `mi.traverse` shows: `material.*` is the material under test, `floor.*` the paper, `sky.*`, `lamp.*`,
 `sensor.*`. The only shape with the material is `ball`.
 
 Lengths are in units of the shell's radius, z is up. Radiance is scaled so that exposure 0 suits the picture
@@ -87,7 +87,7 @@ def preview_scene(
         "type": "scene",
         "integrator": _integrator(integrator, max_depth),
         "sensor": _sensor(resolve_camera(camera), size, spp, rfilter),
-        "material": dict(bsdf),
+        "material": {key: value for key, value in bsdf.items() if key != "id"},
         "ball": {
             "type": "ply",
             "filename": str(shader_ball_file()),
@@ -255,7 +255,7 @@ def _floor() -> dict[str, Any]:
     return {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().scale(PAPER_SIZE / 2.0),
-        "bsdf": {"type": "diffuse", "id": "floor_material", "reflectance": pattern},
+        "bsdf": {"type": "diffuse", "reflectance": pattern},
     }
 
 
