@@ -1,0 +1,56 @@
+"""Random parameters and directions for the tests of the target."""
+
+import numpy as np
+
+from nma.ops import Color, Vec3
+from nma.target import Blend, Principled
+
+
+def random_principled(rng: np.random.Generator, n: int, dialect: bool = True) -> Principled:
+    """(n,) sets: widths spread over decades, pure cases frequent; `dialect` adds what the paper leaves out."""
+
+    def often_pure():
+        u = rng.random(n)
+        return np.where(rng.random(n) < 0.4, np.round(u), u)
+
+    return Principled(
+        base_color=Color(*rng.random((3, n)) ** 2),
+        roughness=10.0 ** rng.uniform(-1.5, 0.0, n),
+        metallic=often_pure(),
+        specular=rng.uniform(0.001, 1.8, n),
+        spec_tint=often_pure(),
+        sheen=often_pure(),
+        sheen_tint=often_pure(),
+        clearcoat=often_pure(),
+        clearcoat_gloss=often_pure(),
+        anisotropic=often_pure() * dialect,
+        flatness=often_pure() * dialect,
+    )
+
+
+def random_blend(rng: np.random.Generator, n: int, n_instances: int, dialect: bool = True) -> Blend:
+    """(n,) blends of instances with random weights that sum to one."""
+    weights = rng.dirichlet(np.ones(n_instances), n).T
+    return Blend(tuple(random_principled(rng, n, dialect) for _ in range(n_instances)), tuple(weights))
+
+
+def random_directions(rng: np.random.Generator, n: int) -> Vec3:
+    """(n,) directions above the horizon, uniform in the cosine; every tenth grazes."""
+    z = rng.random(n)
+    z = np.where(rng.random(n) < 0.1, 10.0 ** rng.uniform(-6, -1, n), z)
+    phi = rng.uniform(0, 2 * np.pi, n)
+    sin_theta = np.sqrt(1 - z * z)
+    return Vec3(sin_theta * np.cos(phi), sin_theta * np.sin(phi), z)
+
+
+def mapped(tree, f):
+    """The same nested tuples with `f` applied to every array; plain numbers stay."""
+    if isinstance(tree, tuple):
+        parts = [mapped(t, f) for t in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return f(tree) if isinstance(tree, np.ndarray) else tree
+
+
+def stacked(c: Vec3) -> np.ndarray:
+    """(3, ...) NumPy array of a triple of arrays of any library."""
+    return np.stack(np.broadcast_arrays(*(np.asarray(x) for x in c)))
