@@ -69,7 +69,7 @@ def bin_points_at(
     mu_o = ops.clip(mu_i + s, 1e-6, 1.0)
     step = math.pi / grid.phi_o
     low = (grid.phi_o - 1.0 - p) * step
-    scale = ops.minimum((2.0 * _FINEST) * mu_i / ops.maximum(sin_i, 1e-4), 1.0)
+    scale = ops.clip((2.0 * _FINEST) * mu_i / ops.maximum(sin_i, 1e-4), 1e-6, 1.0)
     psi, psi_density = _crowd(u[1], low, low + step, scale)
     return Points(*_directions(mu_i, mu_o, psi), 1.0 / (s_density * width * psi_density * step))
 

@@ -38,7 +38,7 @@ def tabulate_adapter(adapter: Adapter, params: NDArray, *, shift: float = 0.0, g
     """The adapter's bin averages (n, theta_i, theta_o, phi, 3). `shift` in [0, 1) selects another set of points."""
     params = adapter.space.check(params, "training", clamp=True) if adapter.encoding != "direction" else params
     strata = np.arange(grid.theta_i * _DIRECTIONS)
-    jitter = (strata * 0.6180339887 + shift) % 1.0
+    jitter = (strata * 0.6180339887 + 0.31 + shift) % 1.0
     mu = ((strata + jitter) / len(strata)).astype(np.float32)
     return np.stack([_tabulate(adapter.numbers(p[None], mu)[0], mu, shift, adapter, grid) for p in params])
 

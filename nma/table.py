@@ -8,7 +8,7 @@ grazing, and in the azimuth between wi and wo folded to [0, pi], mirror directio
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,13 @@ class Tables:
     def albedo(self) -> NDArray[np.float64]:
         """Directional albedo (n, theta_i[, phi_i], 3): 2 pi times the mean over the bins of wo."""
         return 2.0 * math.pi * self.values.mean(axis=(-3, -2), dtype=np.float64)
+
+    @staticmethod
+    def concatenate(parts: Sequence[Tables]) -> Tables:
+        """One after the other; all of them with errors, or none."""
+        fields = [np.concatenate([getattr(t, f) for t in parts]) for f in ("params", "values", "walks")]
+        error = None if parts[0].error is None else np.concatenate([t.error for t in parts])
+        return Tables(*fields, error)
 
     def save(self, path: str | Path) -> None:
         """Writes the reference-file format of CONVENTIONS.md, atomically."""

@@ -49,4 +49,6 @@ def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.A
     width = 3.0 * sigma + _TOLERANCE
     size = jnp.abs(residual)
     huber = jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)
-    return (huber * batch.weight).mean(), log_loss
+    # An error d of the logarithm is an error (1 + value) d of the value itself.
+    emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
+    return (huber * emphasis * batch.weight).mean(), log_loss

@@ -20,6 +20,7 @@ class Recipe:
     - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
     - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so
       that noisy bins pull towards their mean rather than their median.
+    - `energy`: adds this much of the linear error to the logarithmic one, so that bright bins count for their energy too.
     - `schedule`: "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls, "constant" keeps it.
     - `average`: decay of the exponential moving average of the weights; 0 means none.
     """
@@ -34,6 +35,7 @@ class Recipe:
     points_law: Literal["crowded", "uniform", "centre"] = "crowded"
     bins_law: Literal["mirror", "uniform"] = "mirror"
     loss: Literal["huber", "log"] = "huber"
+    energy: float = 0.02
     schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
     learning_rate: float = 3e-3
     average: float = 0.999
@@ -64,6 +66,7 @@ PAPER = Recipe(
     points_law="uniform",
     bins_law="uniform",
     loss="log",
+    energy=0.0,
     learning_rate=1e-5,
     average=0.0,
 )

@@ -1,0 +1,35 @@
+"""The command line: parse, call, print. No physics here; one file per group of commands."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from nma.cli import data, learn, system, view
+from nma.errors import NmaError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs by a tiny network.\n\n"
+    "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
+    "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], judge with [bold]evaluate[/bold] and "
+    "[bold]compare[/bold], look with [bold]render[/bold].",
+)
+for group in (data, learn, view, system):
+    group.register(app)
+
+
+def main() -> None:
+    """Entry point of the `nma` command: expected errors become one line on stderr and exit status 1."""
+    try:
+        app()
+    except NmaError as e:
+        print(f"nma: {e}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("nma: interrupted; run the same command again to go on where it can be resumed", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,111 @@
+"""`nma materials`, `simulate`, `dataset`: what there is, and what it looks like when simulated."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from nma.cli import console
+from nma.errors import TableError
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(materials)
+    app.command()(simulate)
+    app.command()(dataset)
+
+
+def materials(name: Annotated[str | None, typer.Argument(help="Show this material's parameters.")] = None) -> None:
+    """List the named materials, or show one of them."""
+    from nma import materials as library
+
+    if name is None:
+        rows = [(m.name, m.title, m.description) for m in map(library.load, library.names())]
+        console.out.print(console.table(("name", "title", "description"), rows))
+        return
+    material = library.load(name)
+    rows = [(p.name, p.symbol, f"{p.low:g} .. {p.high:g}", _show(material.values[p.name])) for p in material.space.params]
+    console.out.print(console.table(("parameter", "symbol", "range", "value"), rows, f"{material.title}: {material.description}"))
+
+
+def simulate(
+    output: Annotated[Path, typer.Option("--output", "-o", help="The reference file (.npz) to write.")],
+    params: Annotated[Path | None, typer.Option(help="A file (.npz) with `params` (n, 13), a reference file for example.")] = None,
+    material: Annotated[list[str] | None, typer.Option(help="A named material or material file; may be repeated.")] = None,
+    draw: Annotated[int, typer.Option(help="Draw this many materials at random instead.")] = 0,
+    population: Annotated[str, typer.Option(help="Where drawn conductors come from: mixed, range, metals, held_out_metals.")] = "mixed",
+    class_name: Annotated[str, typer.Option("--class", help="The class of the source materials.")] = "layered3",
+    walks: Annotated[int, typer.Option(help="Random walks per material.")] = 16_000_000,
+    seed: Annotated[int, typer.Option(help="Seed of the walks and of the drawn materials.")] = 0,
+) -> None:
+    """Simulate materials and write their tables with standard errors: a reference file.
+
+    Example: [bold]nma simulate --material gold-red-lacquer --walks 128000000 -o gold.npz[/bold]
+    """
+    from nma import sources
+    from nma.table import Tables, stream_keys, tabulate
+
+    source = sources.get(class_name)
+    vectors = _vectors(source.space, params, material, draw, population, seed)
+    parts = []
+    with console.progress("Mwalks/s") as bar:
+        task = bar.add_task("simulating", total=len(vectors), rate="", note="")
+        began = time.perf_counter()
+        for n, vector in enumerate(vectors):
+            parts.append(tabulate(source, vector[None], walks, stream_keys(seed, range(n, n + 1))))
+            rate = (n + 1) * walks / (time.perf_counter() - began) / 1e6
+            bar.update(task, completed=n + 1, rate=f"{rate:.1f}")
+    Tables.concatenate(parts).save(output)
+    console.err.print(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
+
+
+def dataset(
+    class_name: Annotated[str, typer.Argument(help="The class to sample, layered3.")],
+    output: Annotated[Path, typer.Argument(help="The dataset (.zarr folder) to create or complete.")],
+    materials: Annotated[int, typer.Option(help="Number of materials.")] = 8000,
+    walks: Annotated[int, typer.Option(help="Random walks per material.")] = 819_200,
+    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal datasets.")] = 0,
+    population: Annotated[str, typer.Option(help="mixed, range, metals or held_out_metals.")] = "mixed",
+) -> None:
+    """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
+    from nma.dataset import Dataset, Settings
+
+    data = Dataset.create(output, Settings(class_name, materials, walks, seed, population))  # type: ignore[arg-type]
+    before = materials - len(data.missing())
+    with console.progress("Mwalks/s") as bar:
+        task = bar.add_task("simulating", total=materials, completed=before, rate="", note="")
+        began = time.perf_counter()
+
+        def progress(done: int) -> None:
+            rate = (done - before) * walks / (time.perf_counter() - began) / 1e6
+            bar.update(task, completed=done, rate=f"{rate:.1f}")
+
+        data.write(progress)
+    console.err.print(f"{output}: complete, {materials} materials")
+
+
+def _vectors(space, params, material, draw, population, seed):
+    """The parameter vectors that `simulate` was asked for, from exactly one of its three sources."""
+    if (params is not None) + bool(material) + bool(draw) != 1:
+        raise typer.BadParameter("give exactly one of --params, --material and --draw")
+    if params is not None:
+        try:
+            with np.load(params) as f:
+                return space.check(f["params"])
+        except (OSError, KeyError, ValueError) as e:
+            raise TableError(f"{params}: no .npz file with an array `params` (n, {space.size}): {e}") from None
+    if material:
+        from nma import materials as library
+
+        return np.stack([library.load(m).vector() for m in material])
+    return space.sample(np.random.default_rng(seed), draw, population)
+
+
+def _show(value: object) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"{x:.4g}" for x in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

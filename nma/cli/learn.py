@@ -1,0 +1,224 @@
+"""`nma train`, `fit`, `evaluate`: learning adapters, and judging them."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from nma.cli import console
+
+_Steps = Annotated[int | None, typer.Option(help="Number of optimisation steps.")]
+_Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.")]
+_Seed = Annotated[int | None, typer.Option(help="Seed of the weights and of the batches.")]
+_Rate = Annotated[float | None, typer.Option(help="Learning rate (its peak under the onecycle schedule).")]
+_Points = Annotated[int | None, typer.Option(help="Points per bin of the AvA estimate (eq. 6).")]
+_PointsLaw = Annotated[str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")]
+_Loss = Annotated[str | None, typer.Option(help="huber, or log (the paper's eq. 7).")]
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(train)
+    app.command()(fit)
+    app.command()(evaluate)
+
+
+def train(
+    class_name: Annotated[str, typer.Argument(help="The class to learn, layered3.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    data: Annotated[Path | None, typer.Option(help="A dataset made by `nma dataset`.")] = None,
+    stream: Annotated[int, typer.Option(help="Without a dataset: keep this many fresh materials in memory, replaced as training goes on.")] = 0,
+    walks: Annotated[int, typer.Option(help="Walks per streamed material.")] = 819_200,
+    preset: Annotated[str, typer.Option(help="class, or paper for the paper's recipe.")] = "class",
+    variant: Annotated[str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")] = "blended+omega_i",
+    instances: Annotated[int | None, typer.Option(help="Principled instances in the blend (1 to 5), instead of the variant's.")] = None,
+    network: _Network = None,
+    steps: _Steps = None,
+    points: _Points = None,
+    points_law: _PointsLaw = None,
+    loss: _Loss = None,
+    learning_rate: _Rate = None,
+    seed: _Seed = None,
+) -> None:
+    """Train an adapter for a whole class. A killed run goes on from its checkpoint (OUTPUT.ckpt).
+
+    Example: [bold]nma dataset layered3 l3.zarr && nma train layered3 --data l3.zarr -o my.safetensors[/bold]
+    """
+    from nma import sources
+    from nma.train import recipe as recipes
+    from nma.train import run as training
+
+    lobes, directional = _variant(variant)
+    recipe = recipes.preset(
+        preset,
+        network=network,
+        steps=steps,
+        points=points,
+        points_law=points_law,
+        loss=loss,
+        learning_rate=learning_rate,
+        seed=seed,
+        instances=instances or lobes,
+        directional=directional,
+    )
+    space = sources.get(class_name).space
+    tables, record, streaming = _training_data(class_name, data, stream, walks, recipe.seed)
+    checkpoint = output.with_name(output.name + ".ckpt")
+    with _TrainingBar(recipe) as bar:
+        adapter, run = training.train_class(
+            space, recipe, tables, record, checkpoint=checkpoint, streaming=streaming, progress=bar.update
+        )
+    _finish(adapter, run, output)
+    checkpoint.unlink(missing_ok=True)
+
+
+def fit(
+    material: Annotated[str, typer.Argument(help="A named material or a material file.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    walks: Annotated[int, typer.Option(help="Walks of the table to fit.")] = 64_000_000,
+    variant: Annotated[str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")] = "blended+omega_i",
+    network: _Network = None,
+    steps: _Steps = None,
+    points: _Points = None,
+    points_law: _PointsLaw = None,
+    loss: _Loss = None,
+    learning_rate: _Rate = None,
+    seed: _Seed = None,
+) -> None:
+    """Overfit one material: simulate its table, then train a small network on it.
+
+    Example: [bold]nma fit gold-red-lacquer -o gold.safetensors[/bold]
+    """
+    from nma import materials, sources
+    from nma.table import stream_keys, tabulate
+    from nma.train import recipe as recipes
+    from nma.train import run as training
+
+    source_material = materials.load(material)
+    source = sources.get(source_material.class_name)
+    lobes, directional = _variant(variant)
+    recipe = recipes.preset(
+        "single",
+        network=network,
+        steps=steps,
+        points=points,
+        points_law=points_law,
+        loss=loss,
+        learning_rate=learning_rate,
+        seed=seed,
+        instances=lobes,
+        directional=directional,
+    )
+    vector = source_material.vector()
+    began = time.perf_counter()
+    tables = tabulate(source, vector[None], walks, stream_keys(recipe.seed, range(1)), error=False)
+    console.err.print(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
+    record = {"data": f"material {material}", "material": source_material.name, "walks_per_material": walks}
+    with _TrainingBar(recipe) as bar:
+        adapter, run = training.fit_material(source.space, recipe, vector, tables, record, progress=bar.update)
+    _finish(adapter, run, output)
+
+
+def evaluate(
+    weights: Annotated[str, typer.Argument(help="A weights file or the name of a shipped adapter.")],
+    reference: Annotated[Path, typer.Option(help="A reference file made by `nma simulate`.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")] = False,
+) -> None:
+    """Compare an adapter with reference tables over the paper's bins: means over bins and RGB, then over materials.
+
+    The adapter's own bin averages are integrated with points crowded where lobes are narrow; the table's last line
+    says how exact they are. See docs/evaluation.md for every figure's formula.
+    """
+    from nma.adapter import Adapter
+    from nma.evaluate import evaluate as run
+    from nma.metrics import FIGURES
+    from nma.table import Tables
+
+    adapter = Adapter.load(weights)
+    tables = Tables.load(reference)
+    with console.progress("materials/s") as bar:
+        task = bar.add_task("evaluating", total=len(tables.params), rate="", note="")
+        began = time.perf_counter()
+
+        def progress(done: int) -> None:
+            bar.update(task, completed=done, rate=f"{done / (time.perf_counter() - began):.2f}")
+
+        result = run(adapter, tables, progress)
+    if as_json:
+        print(json.dumps({"mean": result.mean, "materials": result.materials}))
+        return
+    rows = [(str(n), *(m[f] for f in FIGURES)) for n, m in enumerate(result.materials)]
+    rows.append(("mean", *(result.mean[f] for f in FIGURES)))
+    console.out.print(console.table(("material", *FIGURES), rows, f"{weights} ({adapter.variant}) against {reference}"))
+    console.out.print(f"The adapter's bin averages are exact to {result.integration_error:.1e} in log loss.")
+    if result.estimated_error:
+        console.out.print("The reference has no standard errors; its noise floor is an upper bound from counting walks.")
+
+
+def _variant(name: str) -> tuple[int, bool]:
+    """(instances, whether parameters vary with wi) of the paper's four variants."""
+    variants = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
+    if name not in variants:
+        raise typer.BadParameter(f"variant must be one of {', '.join(variants)}, got '{name}'")
+    return variants[name]
+
+
+def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
+    """(first tables, record of their origin, settings of the stream or None)."""
+    from nma.dataset import Dataset, Settings, simulate_block
+
+    if (data is None) == (stream == 0):
+        raise typer.BadParameter("give either --data DATASET or --stream MATERIALS")
+    if data is not None:
+        dataset = Dataset.open(data)
+        if dataset.settings.class_name != class_name:
+            raise typer.BadParameter(f"{data} holds class {dataset.settings.class_name}, not {class_name}")
+        with console.err.status(f"reading {dataset.settings.materials} tables"):
+            tables = dataset.load()
+        return tables, {"data": "dataset", "dataset": asdict(dataset.settings)}, None
+    settings = Settings(class_name, stream, walks, seed)
+    with console.err.status(f"simulating the first {stream} materials"):
+        tables = simulate_block(settings, range(stream))
+    tables.values = tables.values.astype(np.float16)
+    return tables, {"data": "stream", "dataset": asdict(settings)}, settings
+
+
+def _finish(adapter, run, output: Path) -> None:
+    """Writes weights and loss plot, and says so."""
+    from nma.train.plot import plot_losses
+
+    adapter.save(output)
+    plot = plot_losses(run.log_losses, output.with_suffix(".loss.png"), output.name)
+    console.err.print(
+        f"{output}: {adapter.variant}, {run.step} steps in {run.seconds:.0f} s, "
+        f"log loss of the last steps {np.mean(run.log_losses[-500:]):.5f} (against noisy bins); losses in {plot}"
+    )
+
+
+class _TrainingBar:
+    """A progress bar that shows the loss over the last steps and bins per second."""
+
+    def __init__(self, recipe: Any):
+        self._bar, self._recipe = console.progress("Mbins/s"), recipe
+        self._began, self._first = time.perf_counter(), None
+
+    def __enter__(self) -> _TrainingBar:
+        self._bar.__enter__()
+        self._task = self._bar.add_task("training", total=self._recipe.steps, rate="", note="")
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        self._bar.__exit__(*args)
+
+    def update(self, run: Any) -> None:
+        if self._first is None:
+            self._first, self._began = run.step, time.perf_counter()
+            return
+        rate = (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
+        loss = np.mean(run.log_losses[-500:])
+        self._bar.update(self._task, completed=run.step, rate=f"{rate:.2f}", note=f"log loss {loss:.5f}")

@@ -1,0 +1,129 @@
+"""Training runs from data to a weights file: a whole class, or one material."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+import nma
+from nma import encoding, network, target
+from nma.adapter import Adapter
+from nma.dataset import Settings, stream
+from nma.network import Layers
+from nma.ops import Color
+from nma.params import ParamSpace
+from nma.table import Tables
+from nma.target import Blend, Principled
+from nma.train import loop
+from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.recipe import Recipe
+
+# Where training starts: a coloured rough metal under a sharp, colourless reflection.
+_INITIAL = Blend(
+    (
+        Principled(Color(0.5, 0.5, 0.5), 0.5, 0.5, 0.5, 0.1, 0.1, 0.1, 0.1, 0.5),
+        Principled(Color(0.5, 0.5, 0.5), 0.15, 0.5, 0.5, 0.1, 0.1, 0.1, 0.1, 0.5),
+    ),
+    (0.6, 0.4),
+)
+
+
+def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
+    """Random layers whose output starts at a plausible blend; determined by the recipe's seed."""
+    instances = tuple(_INITIAL.instances[k % 2] for k in range(recipe.instances))
+    blend = Blend(instances, (1.0 / recipe.instances,) * recipe.instances)
+    bias = np.array(target.encode(blend if recipe.instances != 2 else _INITIAL))
+    inputs = encoding.size(recipe.encoding, space, recipe.directional)
+    sizes = [inputs, *network.hidden(recipe.network), target.output_size(recipe.instances)]
+    return network.init(np.random.default_rng((recipe.seed, 0x1417)), sizes, bias)
+
+
+def train_class(
+    space: ParamSpace,
+    recipe: Recipe,
+    tables: Tables,
+    record: dict[str, Any],
+    *,
+    checkpoint: Path | None = None,
+    streaming: Settings | None = None,
+    progress: Callable[[loop.Run], None] = lambda run: None,
+    budget_seconds: float = float("inf"),
+) -> tuple[Adapter, loop.Run]:
+    """Trains on tables of many materials; `record` says where they come from and is stored with the weights.
+
+    With `streaming`, the tables are only the first content of the pool: fresh materials replace them as fast as they can
+    be simulated between steps, which makes losses depend on the machine's speed.
+    """
+    pool = Pool.of(tables)
+    sampler = BinSampler(recipe.bins_law)
+    layers = initial_layers(recipe, space)
+    run = loop.resume(recipe, layers, checkpoint) if checkpoint else loop.start(recipe, layers)
+    report = _refreshing(pool, streaming, progress) if streaming else progress
+    loop.train(
+        recipe,
+        run,
+        lambda step: draw(pool, sampler, recipe, step),
+        checkpoint=checkpoint,
+        progress=report,
+        budget_seconds=budget_seconds,
+    )
+    return _adapter(space, recipe, run, record), run
+
+
+def fit_material(
+    space: ParamSpace,
+    recipe: Recipe,
+    params: NDArray[np.float64],
+    tables: Tables,
+    record: dict[str, Any],
+    *,
+    progress: Callable[[loop.Run], None] = lambda run: None,
+    budget_seconds: float = float("inf"),
+) -> tuple[Adapter, loop.Run]:
+    """Overfits the table of one material (paper Fig. 4, left)."""
+    record = {**record, "params": np.asarray(params).ravel().tolist()}
+    return train_class(space, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
+
+
+def _refreshing(pool: Pool, settings: Settings, progress: Callable[[loop.Run], None]) -> Callable[[loop.Run], None]:
+    """A progress callback that also exchanges a block of the pool, each time it is called."""
+    fresh = stream(settings, first=len(pool.params))
+    replaced = 0
+
+    def report(run: loop.Run) -> None:
+        nonlocal replaced
+        tables = next(fresh)
+        pool.replace(replaced, tables)
+        replaced += len(tables.params)
+        progress(run)
+
+    return report
+
+
+def _adapter(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str, Any]) -> Adapter:
+    """The trained adapter with its record."""
+    tail = run.log_losses[-1000:]
+    training = {
+        **record,
+        "recipe": asdict(recipe),
+        "steps": run.step,
+        "bins_seen": run.step * recipe.bins_per_step,
+        "seconds": round(run.seconds, 1),
+        "log_loss_of_last_1000_steps": float(np.mean(tail)) if tail else None,
+        "version": nma.__version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "machine": platform.machine(),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+    return Adapter(
+        space, recipe.encoding, loop.result(run, recipe), recipe.instances, recipe.directional, target.PRINCIPLED_PARAMS, training
+    )
