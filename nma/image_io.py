@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,9 +78,10 @@ def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shou
     return _write_atomically(path, lambda temporary: Image.fromarray(array).save(temporary, format="PNG"))
 
 
-def write_exr(path: str | Path, image: ArrayLike) -> Path:
-    """Write linear values (height, width), (height, width, 1) or (height, width, 3) as a 32-bit float EXR.
+def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) -> Path:
+    """Write linear values (height, width) or (height, width, channels) as a 32-bit float EXR.
 
+    Three channels are RGB, four RGBA; `channels` names them where they are something else.
     Values that are not finite are kept: an EXR is also for looking into what went wrong.
     """
     import mitsuba as mi
@@ -87,13 +89,15 @@ def write_exr(path: str | Path, image: ArrayLike) -> Path:
     array = np.ascontiguousarray(image, dtype=np.float32)
     if array.ndim not in (2, 3) or 0 in array.shape:
         raise ImageError(f"{path}: cannot write an array of shape {array.shape} as an image")
-    return _write_atomically(path, lambda temporary: mi.Bitmap(array).write(str(temporary)))
+    kind = mi.Bitmap.PixelFormat.MultiChannel if channels else None
+    bitmap = mi.Bitmap(array, kind, list(channels))
+    return _write_atomically(path, lambda temporary: bitmap.write(str(temporary)))
 
 
 def read_image(path: str | Path) -> NDArray[np.float32]:
     """Read EXR, HDR or PFM (linear as stored) or PNG and JPEG (sRGB, made linear) as (height, width, 3) float32.
 
-    Grey images are repeated over RGB, alpha is dropped.
+    Grey images are repeated over RGB, alpha is dropped. Of an EXR with several layers the first one in colour counts.
 
     Raises:
         ImageError: the file does not exist or cannot be decoded.
@@ -104,9 +108,19 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
         raise ImageError(f"image {path} does not exist")
     try:
         bitmap = mi.Bitmap(str(path))
+        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+            bitmap = _colours(bitmap)
         return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
     except RuntimeError as error:
         raise ImageError(f"image {path} cannot be read: {error}") from error
+
+
+def _colours(bitmap: Any) -> Any:
+    """The first layer with red, green and blue, else the bitmap itself."""
+    import mitsuba as mi
+
+    formats = (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA)
+    return next((layer for _, layer in bitmap.split() if layer.pixel_format() in formats), bitmap)
 
 
 def _write_atomically(path: str | Path, write: Callable[[Path], object]) -> Path:

@@ -183,3 +183,9 @@ def test_contact_sheet_refuses(fault, tmp_path: Path, picture):
     }[fault]
     with pytest.raises(ImageError):
         contact_sheet(tmp_path / "a.png", rows, ["one", "two"])
+
+
+def test_layers_of_an_exr_keep_their_names_and_the_colours_are_found(tmp_path):
+    image = np.random.default_rng(0).random((4, 5, 4), dtype=np.float32)
+    path = write_exr(tmp_path / "layers.exr", image, ["R", "G", "B", "depth.T"])
+    np.testing.assert_array_equal(read_image(path), image[..., :3])

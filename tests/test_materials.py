@@ -80,6 +80,18 @@ def test_a_file_reads_into_the_vector_of_its_class(write):
     assert material.name == "test"
 
 
+def test_parameters_can_be_changed_as_in_a_file(write, tmp_path):
+    changed = materials.load(write()).changed(
+        {"conductor": "Ag", "alpha_top": 0.3, "albedo": [0.1, 0.2, 0.3]}
+    )
+    silver = load_conductors().names.index("Ag")
+    assert changed.values["eta_conductor"] == tuple(load_conductors().eta[silver])
+    np.testing.assert_array_equal(changed.vector()[[0, 1, 9, 10, 11]], [0.3, 0.2, 0.1, 0.2, 0.3])
+    for wrong in ({"alpha_tip": 0.1}, {"alpha_top": 2.0}, {"sigma_t": {"texture": str(tmp_path / "no.png")}}):
+        with pytest.raises(MaterialError, match="--set"):
+            changed.changed(wrong, "--set")
+
+
 def test_a_conductor_may_be_given_by_its_index(write):
     material = materials.load(write('conductor = "Au"', "eta_conductor = [1, 2, 3]\nk_conductor = 4"))
     np.testing.assert_array_equal(material.vector()[3:9], [1, 2, 3, 4, 4, 4])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +104,13 @@ class Material:
         numbers: dict[str, Any] = dict(self.values)
         return self.space.vector(numbers)
 
+    def changed(self, given: Mapping[str, Any], where: str | Path = "changes") -> Material:
+        """A copy with some parameters replaced, given as in a file: numbers, lists, `conductor`, textures.
+
+        Texture paths are relative to the folder of `where`, which errors name. Raises `MaterialError`.
+        """
+        return replace(self, values=self.values | _values(given, self.space, Path(where), partial=True))
+
 
 def names() -> tuple[str, ...]:
     """Names of the materials shipped with the package, sorted."""
@@ -150,18 +157,18 @@ def _parse(document: Mapping[str, Any], path: Path) -> Material:
     return Material(path.stem, title, description, class_name, values)
 
 
-def _values(given: Mapping[str, Any], space: ParamSpace, path: Path) -> dict[str, Any]:
-    """One checked value per parameter of the class, in its order."""
+def _values(given: Mapping[str, Any], space: ParamSpace, path: Path, partial: bool = False) -> dict[str, Any]:
+    """One checked value per parameter of the class, in its order; only those given if `partial`."""
     given = _with_indices(given, path)
     known = [param.name for param in space.params]
     _refuse_unknown(given, (*known, "conductor"), f"{path}, [parameters]")
-    if missing := [name for name in known if name not in given]:
+    if not partial and (missing := [name for name in known if name not in given]):
         raise MaterialError(f"{path}, [parameters]: {', '.join(missing)} missing")
-    values = {param.name: _value(given[param.name], param, path) for param in space.params}
+    values = {p.name: _value(given[p.name], p, path) for p in space.params if p.name in given}
 
-    # Textures are checked when they are read; any allowed number stands in for them here.
-    numbers: dict[str, Any] = dict(values)
-    numbers |= {name: space[name].low for name, value in values.items() if isinstance(value, Texture)}
+    # Textures are checked when they are read; any allowed number stands in for them here, and for what is not given.
+    numbers: dict[str, Any] = {param.name: param.low for param in space.params}
+    numbers |= {name: value for name, value in values.items() if not isinstance(value, Texture)}
     try:
         space.check(space.vector(numbers))
     except ParamError as error:

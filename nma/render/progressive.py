@@ -1,0 +1,62 @@
+"""Rendering in passes, so that a long rendering shows how far it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.errors import ParamError
+
+# Samples of one pass over the whole picture: a second or so on two cores, and a bound on memory.
+SAMPLES_PER_PASS = 1 << 20
+
+
+def render_passes(
+    scene: Any,
+    spp: int,
+    *,
+    seed: int = 0,
+    sensor: int = 0,
+    progress: Callable[[int, float], None] = lambda done, rate: None,
+) -> NDArray[np.float32]:
+    """Render a loaded scene in passes of equal size and average them: (height, width, channels).
+
+    Equal seeds give equal pictures. Passes draw from streams of their own, also those of neighbouring seeds.
+
+    Args:
+        scene: what `mi.load_dict` or `mi.load_file` returned.
+        spp: samples per pixel in total; the last pass may be smaller than the others.
+        progress: called after each pass with the samples per pixel done so far, and their number per second.
+
+    Raises:
+        ParamError: spp below 1.
+    """
+    import mitsuba as mi
+
+    if spp < 1:
+        raise ParamError(f"{spp} samples per pixel; take at least 1")
+    width, height = scene.sensors()[sensor].film().crop_size()
+    passes = pass_sizes(spp, int(width) * int(height))
+    began, done, total = time.perf_counter(), 0, np.zeros(())
+    for number, samples in enumerate(passes):
+        image = mi.render(scene, sensor=sensor, spp=samples, seed=_pass_seed(seed, number))  # type: ignore[arg-type]
+        total = total + samples * np.array(image, dtype=np.float64)
+        done += samples
+        progress(done, done / (time.perf_counter() - began))
+    return (total / spp).astype(np.float32)
+
+
+def pass_sizes(spp: int, pixels: int) -> list[int]:
+    """Samples per pixel of each pass, as equal as can be without a third size: every size compiles anew."""
+    passes = -(-spp * pixels // SAMPLES_PER_PASS)
+    each = -(-spp // min(passes, spp))
+    return [each] * (spp // each) + ([spp % each] if spp % each else [])
+
+
+def _pass_seed(seed: int, number: int) -> int:
+    """Hashed, as seed + number would repeat passes of the next seed."""
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
