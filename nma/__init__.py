@@ -1,3 +1,60 @@
-"""Neural Material Adapter: expensive materials translated into blends of Principled BRDFs by a tiny network."""
+"""Neural Material Adapter: expensive materials translated into blends of Principled BRDFs by a tiny network.
+
+The names below are the public interface; each is imported when it is first used, so that `import nma` costs nothing.
+`import nma.render` registers the BSDFs `nma` and `layered` with Mitsuba. docs/python.md shows them at work.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from nma.adapter import Adapter, shipped
+    from nma.dataset import Dataset, Settings
+    from nma.errors import NmaError
+    from nma.evaluate import evaluate as evaluate_adapter
+    from nma.evaluate import tabulate_adapter
+    from nma.image_metrics import compare_images
+    from nma.materials import load as load_material
+    from nma.materials import names as material_names
+    from nma.params import LAYERED3, ParamSpace
+    from nma.render.scene import preview_scene
+    from nma.sources import get as source
+    from nma.table import Tables, tabulate
+
+_HOMES = {
+    "Adapter": "nma.adapter",
+    "shipped": "nma.adapter",
+    "Dataset": "nma.dataset",
+    "Settings": "nma.dataset",
+    "NmaError": "nma.errors",
+    "evaluate_adapter": "nma.evaluate:evaluate",
+    "tabulate_adapter": "nma.evaluate",
+    "compare_images": "nma.image_metrics",
+    "load_material": "nma.materials:load",
+    "material_names": "nma.materials:names",
+    "LAYERED3": "nma.params",
+    "ParamSpace": "nma.params",
+    "preview_scene": "nma.render.scene",
+    "source": "nma.sources:get",
+    "Tables": "nma.table",
+    "tabulate": "nma.table",
+}
+
+__all__ = [*_HOMES, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'nma' has no attribute '{name}'")
+    home, _, original = _HOMES[name].partition(":")
+    value = getattr(import_module(home), original or name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
