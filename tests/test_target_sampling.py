@@ -1,0 +1,272 @@
+"""Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and of the estimates behind its odds.
+
+In double precision: at grazing angles the narrowest lobes are 1e-5 wide, and bins within them would count the rounding
+of single-precision directions. That single precision draws the same directions is tested with the target itself.
+"""
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from target_cases import mapped, random_blend, random_directions, stacked
+
+from nma import ops, target
+from nma.llvm import ensure_llvm
+from nma.ops import Vec3
+from nma.target import Blend
+from nma.target.sampling import lobe_albedos, sample_clearcoat, sample_diffuse, sample_spec
+
+ensure_llvm()
+
+N_BLENDS = 200
+DEPTH = 7  # 128 bins per blend ...
+FINE = 10  # ... each integrated over 8 parts at least
+PILOT = 1 << 13
+SAMPLES = 100_000
+FAMILY_ERROR = 1e-3  # chance that a correct sampler fails one of the 200 tests
+SIDAK = 1 - (1 - FAMILY_ERROR) ** (1 / N_BLENDS)
+
+
+# ---- A chart of the hemisphere: 1 - cos(theta) and azimuth, both relative to the mirror direction and both through
+# ---- asinh, so that the narrowest lobes and their tails over many decades are equally smooth.
+
+EPSILON = 1e-7
+
+
+def to_chart(w, mirror):
+    """Chart coordinates (a, b) of directions; 1 - cos comes from x and y, which keep their digits near the pole."""
+    t = (w.x * w.x + w.y * w.y) / (1.0 + w.z)
+    phi = dr.atan2(w.y, w.x) - mirror[1]
+    phi = phi - dr.two_pi * dr.round(phi / dr.two_pi)
+    return dr.asinh((t - mirror[0]) / EPSILON), dr.asinh(phi / EPSILON)
+
+
+def from_chart(a, b, mirror):
+    """The direction at (a, b), and the solid angle per unit of area there."""
+    t = dr.clip(mirror[0] + EPSILON * dr.sinh(a), 0.0, 1.0)
+    phi = mirror[1] + EPSILON * dr.sinh(b)
+    r = dr.safe_sqrt(t * (2.0 - t))
+    return Vec3(r * dr.cos(phi), r * dr.sin(phi), 1.0 - t), EPSILON**2 * dr.cosh(a) * dr.cosh(b)
+
+
+def whole_chart(mirror):
+    """(n, 1, 4) boxes a0, a1, b0, b1 of the hemisphere."""
+    seam = np.full_like(mirror[0], np.arcsinh(np.pi / EPSILON))
+    a0, a1 = (np.arcsinh((t - mirror[0]) / EPSILON) for t in (0.0, 1.0))
+    return np.stack([a0, a1, -seam, seam], 1)[:, None]
+
+
+class Cases:
+    """Random blends of 1 to 5 instances, one view direction each, as double-precision tables to gather from."""
+
+    def __init__(self, seed, n=N_BLENDS, dialect=True):
+        rng = np.random.default_rng(seed)
+        blend = random_blend(rng, n, 5, dialect)
+        # Instances beyond a random number get no weight.
+        used = np.arange(5)[:, None] < rng.integers(1, 6, n)
+        weights = np.where(used, stacked(blend.weights) + 1e-3, 0.0)
+        self.blend = Blend(blend.instances, tuple(weights / weights.sum(0)))
+        z = np.where(rng.random(n) < 0.15, 10.0 ** rng.uniform(-3, -1, n), rng.random(n))
+        phi = rng.uniform(0, 2 * np.pi, n)
+        self.wi = Vec3(np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z)
+        self.mirror = (1 - z, np.arctan2(-self.wi.y, -self.wi.x))
+
+    def at(self, Float, index):
+        """Blend, view direction and mirror direction per lane, `index` naming the blend of each."""
+        gather = lambda x: dr.gather(Float, Float(x), index)
+        return mapped((self.blend, self.wi, self.mirror), gather)
+
+
+def drawn(cases, count, seed, sampler):
+    """(n, count) chart coordinates of what `sampler(blend, wi, lane, u)` draws."""
+    n = cases.wi.z.size
+    lane = dr.arange(dr.llvm.UInt, n * count)
+    rng = dr.rng(seed)
+    blend, wi, mirror = cases.at(dr.llvm.Float64, lane // count)
+    wo, valid = sampler(blend, wi, lane, [rng.random(dr.llvm.Float64, n * count) for _ in range(3)])
+    a, b = to_chart(wo, mirror)
+    a = dr.select(valid, a, dr.inf)
+    return a.numpy().reshape(n, count), b.numpy().reshape(n, count)
+
+
+def draw(cases, count, seed, alpha_scale=1.0):
+    """Samples of the blends, invalid ones at a = inf; widths of the specular lobes off by a factor on request."""
+
+    def sampler(blend, wi, lane, u):
+        rough = float(np.sqrt(alpha_scale))
+        off = tuple(p._replace(roughness=p.roughness * rough) for p in blend.instances)
+        wo, _, pdf = target.sample(Blend(off, blend.weights), wi, *u)
+        return wo, pdf > 0
+
+    return drawn(cases, count, seed, sampler)
+
+
+def draw_lobes(cases, count, seed):
+    """Samples of every lobe of every instance in equal shares, whatever its weight; none is invalid."""
+
+    def sampler(blend, wi, lane, u):
+        wo = sample_diffuse(u[1], u[2])
+        for k, (alpha_x, alpha_y, alpha_c) in enumerate(target.lobe_alphas(blend)):
+            wo = ops.select(lane % 11 == 2 * k + 1, sample_spec(wi, alpha_x, alpha_y, u[1], u[2]), wo)
+            wo = ops.select(lane % 11 == 2 * k + 2, sample_clearcoat(wi, alpha_c, u[1], u[2]), wo)
+        # What falls below the horizon helps nowhere: uniform directions instead.
+        z = u[1]
+        r = dr.sqrt(1.0 - z * z)
+        uniform = Vec3(r * dr.cos(dr.two_pi * u[2]), r * dr.sin(dr.two_pi * u[2]), z)
+        return ops.select(wo.z > 0, wo, uniform), dr.llvm.Bool(True)
+
+    return drawn(cases, count, seed, sampler)
+
+
+def adaptive_bins(boxes, a, b):
+    """Cuts `boxes` (n, 1, 4) into (n, 2^FINE, 4) of equal counts of samples; also the cuts that find them."""
+    n = len(boxes)
+    points = np.stack([a, b], -1)[:, None]
+    cuts = []
+    for level in range(FINE):
+        axis = level % 2
+        order = np.argsort(points[..., axis], axis=-1)
+        points = np.take_along_axis(points, order[..., None], axis=2)
+        half = points.shape[2] // 2
+        cut = 0.5 * (points[:, :, half - 1, axis] + points[:, :, half, axis])
+        cuts.append(cut)
+        points = points.reshape(n, -1, half, 2)
+        low, high = boxes.copy(), boxes.copy()
+        low[..., 2 * axis + 1] = cut
+        high[..., 2 * axis] = cut
+        boxes = np.stack([low, high], 2).reshape(n, -1, 4)
+    return boxes, cuts
+
+
+def counts(a, b, cuts):
+    """(n, 2^DEPTH + 1) samples per bin, invalid ones last."""
+    n = len(a)
+    node = np.zeros(a.shape, np.int64)
+    rows = np.arange(n)[:, None]
+    for level, cut in enumerate(cuts[:DEPTH]):
+        node = 2 * node + ((a, b)[level % 2] > cut[rows, node])
+    node = np.where(np.isinf(a), 2**DEPTH, node)
+    size = 2**DEPTH + 1
+    return np.bincount((rows * size + node).ravel(), minlength=n * size).reshape(n, size)
+
+
+def integrate(cases, index, boxes, order=6):
+    """Integral of the density over boxes (m, 4) by Gauss-Legendre, `index` (m,) naming their blends."""
+    Float, UInt = dr.llvm.Float64, dr.llvm.UInt
+    x, w = np.polynomial.legendre.leggauss(order)
+    x, w = 0.5 + 0.5 * x, 0.5 * w
+    m, q = len(boxes), order * order
+    lane = dr.arange(UInt, m * q)
+    box, node = lane // q, lane % q
+    a0, a1, b0, b1 = (dr.gather(Float, Float(boxes[:, k]), box) for k in range(4))
+    blend, wi, mirror = cases.at(Float, dr.gather(UInt, UInt(index), box))
+    wo, solid_angle = from_chart(
+        ops.lerp(a0, a1, dr.gather(Float, Float(x), node // order)),
+        ops.lerp(b0, b1, dr.gather(Float, Float(x), node % order)),
+        mirror,
+    )
+    weight = dr.gather(Float, Float(w), node // order) * dr.gather(Float, Float(w), node % order)
+    density = target.pdf(blend, wi, wo) * solid_angle * weight * (a1 - a0) * (b1 - b0)
+    return dr.block_sum(density, q).numpy()
+
+
+def integrate_adaptively(cases, boxes, tolerance=2e-6):
+    """(n, 2^DEPTH) integrals of the density: boxes are quartered until their parts agree with the whole."""
+    n, bins, _ = boxes.shape
+    owner = np.arange(n * bins)
+    parts = boxes.reshape(-1, 4)
+    whole = integrate(cases, owner // bins, parts)
+    total = np.zeros(n * bins)
+    for _ in range(14):
+        a0, a1, b0, b1 = parts.T
+        am, bm = (a0 + a1) / 2, (b0 + b1) / 2
+        parts = np.stack([[a0, am, b0, bm], [a0, am, bm, b1], [am, a1, b0, bm], [am, a1, bm, b1]])
+        parts = parts.transpose(2, 0, 1)
+        quarters = integrate(cases, np.repeat(owner // bins, 4), parts.reshape(-1, 4)).reshape(-1, 4)
+        done = np.abs(quarters.sum(1) - whole) < tolerance
+        np.add.at(total, owner[done], quarters[done].sum(1))
+        if done.all():
+            return total.reshape(n, 2**DEPTH, -1).sum(2)
+        parts, whole = parts[~done].reshape(-1, 4), quarters[~done].ravel()
+        owner = np.repeat(owner[~done], 4)
+    raise AssertionError("The density does not integrate: it has a singularity.")
+
+
+@pytest.fixture(scope="module")
+def bins():
+    """Random blends, the cuts of their bins, and the expected chance of each bin (n, 2^DEPTH + 1), invalid last."""
+    cases = Cases(seed=31)
+    boxes, cuts = adaptive_bins(whole_chart(cases.mirror), *draw_lobes(cases, PILOT, seed=1))
+    probability = integrate_adaptively(cases, boxes)
+    invalid = 1.0 - probability.sum(1, keepdims=True)
+    return cases, cuts, np.concatenate([probability, invalid], 1)
+
+
+def p_values(bins, seed, alpha_scale=1.0):
+    """One chi-square p-value per blend."""
+    cases, cuts, probability = bins
+    observed = counts(*draw(cases, SAMPLES, seed, alpha_scale), cuts)
+    expected = np.maximum(probability, 0.0) * SAMPLES
+    return np.array([pooled_p_value(o, e) for o, e in zip(observed, expected, strict=True)])
+
+
+def pooled_p_value(observed, expected):
+    """Chi-square with all bins that expect fewer than 5 samples pooled into one."""
+    small = expected < 5
+    observed = np.append(observed[~small], observed[small].sum())
+    expected = np.append(expected[~small], expected[small].sum())
+    if expected[-1] < 5:
+        observed[-2] += observed[-1]
+        expected[-2] += expected[-1]
+        observed, expected = observed[:-1], expected[:-1]
+    statistic = np.sum((observed - expected) ** 2 / expected)
+    return chi2.sf(statistic, len(expected) - 1)
+
+
+def test_densities_integrate_to_the_chance_of_a_valid_sample(bins):
+    _, _, probability = bins
+    assert np.all(probability > -1e-4)
+
+
+def test_samples_follow_their_density(bins):
+    p = p_values(bins, seed=2)
+    assert p.min() > SIDAK, f"blend {p.argmin()}: p = {p.min():.2e} against {SIDAK:.2e}"
+    # Correct p-values are uniform: neither too bad nor too good to be true.
+    assert 0.35 < np.median(p) < 0.65
+
+
+def test_an_alpha_off_by_five_per_cent_is_rejected(bins):
+    p = p_values(bins, seed=3, alpha_scale=1.05)
+    assert p.min() < SIDAK
+    # Not by one lucky blend: most show it.
+    assert np.mean(p < SIDAK) > 0.5
+
+
+def test_odds_follow_the_albedos():
+    """The sum of a blend's estimated albedos is near its true one, so sample weights hardly vary."""
+    cases = Cases(seed=32, dialect=False)
+    count = 4096
+    lane = dr.arange(dr.llvm.UInt, N_BLENDS * count)
+    blend, wi, _ = cases.at(dr.llvm.Float, lane // count)
+    rng = dr.rng(4)
+    _, value, pdf = target.sample(blend, wi, *(rng.random(dr.llvm.Float, N_BLENDS * count) for _ in range(3)))
+    weight = dr.select(pdf > 0, ops.mean(value) / pdf, 0.0).numpy().reshape(N_BLENDS, count)
+    albedo = weight.mean(1)
+    shares = zip(cases.blend.instances, cases.blend.weights, strict=True)
+    estimate = sum(w * sum(lobe_albedos(p, cases.wi)) for p, w in shares)
+    error = np.abs(estimate / albedo - 1)
+    deviation = weight.std(1) / albedo
+    assert np.median(error) < 0.03
+    assert error.max() < 0.25
+    assert np.median(deviation) < 0.2
+    assert deviation.max() < 0.7
+
+
+def test_sampled_values_are_those_of_eval_pdf():
+    rng = np.random.default_rng(33)
+    blend, wi = random_blend(rng, 1000, 3), random_directions(rng, 1000)
+    wo, value, pdf = target.sample(blend, wi, *rng.random((3, 1000)))
+    again, density = target.eval_pdf(blend, wi, wo)
+    np.testing.assert_array_equal(stacked(value), stacked(again))
+    np.testing.assert_array_equal(pdf, density)
+    assert np.all(pdf[wo.z < 0] == 0)
