@@ -78,15 +78,14 @@ class Cases:
 
 
 def drawn(cases, count, seed, sampler):
-    """(n, count) chart coordinates of what `sampler(blend, wi, lane, u)` draws."""
+    """Chart coordinates of what `sampler(blend, wi, lane, u)` draws, `count` lanes for each blend after the other."""
     n = cases.wi.z.size
     lane = dr.arange(dr.llvm.UInt, n * count)
     rng = dr.rng(seed)
     blend, wi, mirror = cases.at(dr.llvm.Float64, lane // count)
     wo, valid = sampler(blend, wi, lane, [rng.random(dr.llvm.Float64, n * count) for _ in range(3)])
     a, b = to_chart(wo, mirror)
-    a = dr.select(valid, a, dr.inf)
-    return a.numpy().reshape(n, count), b.numpy().reshape(n, count)
+    return dr.select(valid, a, dr.inf), b
 
 
 def draw(cases, count, seed, alpha_scale=1.0):
@@ -121,7 +120,7 @@ def draw_lobes(cases, count, seed):
 def adaptive_bins(boxes, a, b):
     """Cuts `boxes` (n, 1, 4) into (n, 2^FINE, 4) of equal counts of samples; also the cuts that find them."""
     n = len(boxes)
-    points = np.stack([a, b], -1)[:, None]
+    points = np.stack([a.numpy(), b.numpy()], -1).reshape(n, 1, -1, 2)
     cuts = []
     for level in range(FINE):
         axis = level % 2
@@ -140,14 +139,14 @@ def adaptive_bins(boxes, a, b):
 
 def counts(a, b, cuts):
     """(n, 2^DEPTH + 1) samples per bin, invalid ones last."""
-    n = len(a)
-    node = np.zeros(a.shape, np.int64)
-    rows = np.arange(n)[:, None]
+    n, size, UInt = len(cuts[0]), 2**DEPTH, dr.llvm.UInt
+    row = dr.arange(UInt, len(a)) // (len(a) // n)
+    node = dr.zeros(UInt, len(a))
     for level, cut in enumerate(cuts[:DEPTH]):
-        node = 2 * node + ((a, b)[level % 2] > cut[rows, node])
-    node = np.where(np.isinf(a), 2**DEPTH, node)
-    size = 2**DEPTH + 1
-    return np.bincount((rows * size + node).ravel(), minlength=n * size).reshape(n, size)
+        border = dr.gather(dr.llvm.Float64, dr.llvm.Float64(cut.ravel()), row * cut.shape[1] + node)
+        node = 2 * node + dr.select((a, b)[level % 2] > border, UInt(1), UInt(0))
+    node = dr.select(dr.isinf(a), UInt(size), node)
+    return np.bincount((row * (size + 1) + node).numpy(), minlength=n * (size + 1)).reshape(n, size + 1)
 
 
 def integrate(cases, index, boxes, order=6):
