@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import drjit as dr
+
+from nma import ops
 from nma.ops import Color, Float, Mask, Vec3
 from nma.params import ParamSpace
 
@@ -44,7 +47,7 @@ class Source(Protocol):
 
     The mean of the throughput over all walks that leave through a set of directions is the integral of f cos(theta_o)
     over that set. A model that only knows its f draws wo from a density p at the first event and returns
-    f cos(theta_o) / p. Throughputs never exceed 1: tables count in fixed point.
+    f cos(theta_o) / p. Throughputs hardly exceed 1: tables count in fixed point.
     """
 
     space: ParamSpace
@@ -61,3 +64,21 @@ class Source(Protocol):
 def throughput(walk: Walk) -> Color:
     """The walk's throughput as a colour."""
     return Color(*walk.throughput)
+
+
+def walk(source: Source, params: Any, wi: Vec3, rng: Random, active: Mask = True) -> tuple[Vec3, Color]:
+    """One whole walk per lane from `wi` (wi.z > 0): (wo, throughput), wo.z > 0.
+
+    Walks that were absorbed, and lanes that are not `active`, have throughput 0. The loop is symbolic, so this may run
+    inside a renderer's own loop.
+    """
+    start = Walk.arriving_from(wi)
+    start.alive = start.alive & active
+    end, _ = dr.while_loop(
+        (start, rng),
+        lambda walk, rng: walk.alive,
+        lambda walk, rng: (source.step(params, walk, rng), rng),
+        label="walk",
+    )
+    out = Vec3(*end.direction)
+    return out, ops.select((out.z > 0) & active, throughput(end), Color.of(0.0))

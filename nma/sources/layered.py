@@ -24,8 +24,12 @@ from nma.ops import Color, Float, Vec3
 from nma.params import LAYERED3
 from nma.sources.base import Random, Walk
 
-# Walks whose brightest channel falls below this go on with a chance in proportion to it (.5 had the least variance times time).
+# Walks whose brightest channel falls below this go on with a chance in proportion to it; .5 had the least variance
+# times time.
 ROULETTE_THRESHOLD = 0.5
+# Chance to go on after total reflection: otherwise a perfect mirror under a smooth coat, without a medium, would hold
+# some walks for ever.
+TRAPPED_SURVIVAL = 0.999
 
 
 @dataclass
@@ -102,7 +106,8 @@ class Layered3:
         height = dr.select(in_medium, height, dr.select(at_bottom, 0.0, 1.0))
 
         result = Color(*walk.throughput) * weight
-        survival, result = _roulette(result, leaves, rng)
+        totally_reflected = upward & ~in_medium & (cos_t <= 0)
+        survival, result = _roulette(result, leaves, totally_reflected, rng)
         return Walk(tuple(out), tuple(result), height, walk.inside | ~reflects, survival & ~leaves)
 
 
@@ -113,8 +118,9 @@ def _uniform_sphere(u1: Float, u2: Float) -> Vec3:
     return Vec3(r * ops.cos(phi), r * ops.sin(phi), z)
 
 
-def _roulette(value: Color, exempt: Any, rng: Random) -> tuple[Any, Color]:
+def _roulette(value: Color, exempt: Any, trapped: Any, rng: Random) -> tuple[Any, Color]:
     """Russian roulette on the brightest channel: (survives, value over the chance of survival)."""
-    chance = dr.select(exempt, 1.0, dr.minimum(ops.max_component(value) * (1.0 / ROULETTE_THRESHOLD), 1.0))
+    most = dr.select(trapped, TRAPPED_SURVIVAL, 1.0)
+    chance = dr.select(exempt, 1.0, dr.minimum(ops.max_component(value) * (1.0 / ROULETTE_THRESHOLD), most))
     survives = rng.next_float32() < chance
     return survives, ops.select(survives, value * (1.0 / dr.maximum(chance, 1e-20)), Color.of(0.0))
