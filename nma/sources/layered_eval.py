@@ -1,0 +1,280 @@
+"""f cos(theta_o) of the layered source at a given pair of directions: an unbiased estimate, and a density close to it.
+
+Walks count what leaves through a set of directions; a renderer also asks for one direction. Light from wi to wo either
+mirrors off the coat, which has a closed form, or crosses it, and then either never meets the medium or scatters in it a
+last time. Each kind is sampled so that no pair of narrow lobes has to meet by chance (compare Guo, Hasan and Zhao 2018,
+section 5). Densities are the walk's, a particle's, without the squared index that radiance gains on entering.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+
+from nma import ops
+from nma.microfacet import (
+    fresnel_conductor_rgb,
+    fresnel_dielectric,
+    ggx_d,
+    refract,
+    sample_visible_normal,
+    smith_g1,
+    visible_normal_pdf,
+)
+from nma.ops import Color, Float, Mask, Vec3
+from nma.sources.base import Random, Walk, throughput
+from nma.sources.layered import Layered3, Layers
+
+# A coat whose index is closer to 1 than this bends light by less than single precision resolves: it is taken as none.
+INDEX_MATCHED = 1e-3
+_ISOTROPIC_PHASE = 0.25 * ops.INV_PI
+# Share of the cosine lobe beside the others before normalisation, for light that the other lobes do not expect.
+_LEAST_DIFFUSE = 0.03
+
+
+def settle(layers: Layers) -> Layers:
+    """The layers as `evaluate` and `pdf` want them: a coat that is almost index-matched becomes exactly so."""
+    return replace(layers, eta_top=dr.select(layers.eta_top < 1.0 + INDEX_MATCHED, 1.0, layers.eta_top))
+
+
+def evaluate(layers: Layers, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True) -> Color:
+    """One unbiased estimate per lane of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
+
+    `layers` come from `settle`. The mean over a set of wo is what `nma.sources.base.walk` counts there.
+    """
+    there, back = _enter(layers, wi, rng), _enter(layers, wo, rng)
+    there.alive = back.alive = there.alive & back.alive & active
+    forward, _ = _unscattered(layers, wi, there, wo, back, rng, True)
+    backward, detour = _unscattered(layers, wo, back, wi, there, rng, False)
+    scattered = _scattered(layers, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
+    # Reciprocity: f cos(theta_i) is known from walks that start at wo, their radiance from below the coat.
+    index2 = layers.eta_top * layers.eta_top
+    backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
+    return forward + backward + coat_reflection(layers, wi, wo)
+
+
+def coat_reflection(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
+    """f cos(theta_o) of the coat's upper side alone [1/sr]. Walter 2007, eq. 20."""
+    m = ops.normalize(wi + wo)
+    fresnel, _ = fresnel_dielectric(ops.maximum(ops.dot(wi, m), 0.0), layers.eta_top)
+    alpha = layers.alpha_top
+    g = smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha)
+    return fresnel * ggx_d(m, alpha, alpha) * g / (4.0 * ops.maximum(wi.z, 1e-7))
+
+
+def _enter(layers: Layers, w: Vec3, rng: Random) -> Walk:
+    """A walk from `w` just below the coat. All of it goes down: what the coat reflects is known in closed form."""
+    alpha = layers.alpha_top
+    view = _above(w)
+    m = sample_visible_normal(view, alpha, alpha, rng.next_float32(), rng.next_float32())
+    fresnel, cos_t = fresnel_dielectric(ops.maximum(ops.dot(view, m), 0.0), layers.eta_top)
+    down = refract(view, m, cos_t, layers.eta_top)
+    weight = ops.select(down.z < 0, (1.0 - fresnel) * smith_g1(down, alpha, alpha), 0.0)
+    one = w.x * 0.0 + 1.0
+    return Walk(tuple(down), (weight, weight, weight), one, one > 0.5, weight > 0)
+
+
+def _crossing(layers: Layers, walk: Walk) -> Walk:
+    """The walk with its throughput dimmed by crossing the whole slab."""
+    dimmed = throughput(walk) * _transmittance(layers, 1.0, Vec3(*walk.direction))
+    return replace(walk, throughput=tuple(dimmed))
+
+
+def _transmittance(layers: Layers, depth: Float, w: Vec3) -> Float:
+    """Fraction that passes `depth` of the slab (all of it: 1) along `w` without meeting the medium."""
+    return ops.exp(-layers.sigma_t * depth / ops.maximum(ops.absolute(w.z), 1e-7))
+
+
+@dataclass
+class _Detour:
+    """One segment of a walk beyond its first, kept by weighted reservoir sampling (Chao 1982)."""
+
+    direction: tuple[Float, Float, Float]
+    tint: tuple[Float, Float, Float]
+    total: Float
+
+    def offer(self, walk: Walk, rng: Random) -> _Detour:
+        weight = ops.select(walk.alive, ops.max_component(throughput(walk)), 0.0)
+        total = self.total + weight
+        take = rng.next_float32() * total < weight
+        tint = throughput(walk) * (1.0 / ops.maximum(weight, 1e-20))
+        return _Detour(
+            tuple(ops.select(take, Vec3(*walk.direction), Vec3(*self.direction))),
+            tuple(ops.select(take, tint, Color(*self.tint))),
+            total,
+        )
+
+    def chosen(self) -> tuple[Vec3, Color]:
+        """Its direction, and its throughput over the chance that it was kept."""
+        return Vec3(*self.direction), Color(*self.tint) * self.total
+
+
+def _unscattered(
+    layers: Layers, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
+) -> tuple[Color, tuple[Vec3, Color]]:
+    """Light from wi to wo that meets interfaces only, and a segment of the walk `there` after its first.
+
+    A path enters through the coat, visits the conductor once or more, and leaves through the coat. All its events but
+    one can be drawn, from either end; the other has to meet by chance, and is best the one whose lobe is the widest
+    there. This walk leaves to chance the way out (it goes on, and asks for wo), or the last visit (the way out is drawn
+    from wo, as `back`). Walking from wo does so for the way in and the first visit; a path of one visit has three such
+    choices. They are joined by a balance heuristic (Veach 1997, eq. 9.8) on the sharpness of those events.
+    """
+    source, clear = Layered3(), replace(layers, sigma_t=layers.sigma_t * 0.0)
+    drawn_up = -Vec3(*back.direction)
+    drawn_out = _out_through_coat(layers, wo, drawn_up)
+    way_in = _bluntness(_out_through_coat(layers, wi, -Vec3(*there.direction))[0])
+    matched = layers.eta_top == 1.0
+
+    def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
+        """What a visit to the conductor sends to wo, and the first visit's bluntness (`first` is 0 before it)."""
+        w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
+        rest = way_in + first
+        # The last visit left to chance; an index-matched coat has no other way out, and no second visit.
+        q, t = drawn_out
+        blunt = _bluntness(_sharpness(layers, w_in, drawn_up))
+        share = ops.select(matched, 1.0, blunt / (blunt + rest + _bluntness(q)))
+        if not forward:
+            share = ops.select(first > 0, share, 0.0)
+        meets = (
+            _mirror_pdf(_above(w_in), drawn_up, layers.alpha_bottom)
+            * t
+            * _transmittance(layers, 1.0, drawn_up)
+        )
+        found = throughput(before) * _conductor_weight(layers, w_in, drawn_up) * (share * meets)
+        # The way out left to chance.
+        q, t = _out_through_coat(layers, wo, went_up)
+        blunt = _bluntness(_sharpness(layers, w_in, went_up))
+        share = ops.select(matched, 0.0, _bluntness(q) / (_bluntness(q) + blunt + rest))
+        found = found + throughput(after) * (share * q * t * _transmittance(layers, 1.0, went_up))
+        return found, ops.select(first > 0, first, blunt)
+
+    def body(walk: Walk, rng: Random, total: tuple, first: Float, detour: _Detour) -> tuple:
+        before = _crossing(layers, walk)
+        after = source.step(clear, before, rng)
+        found, blunt = visit(before, after, first)
+        at_bottom = after.height < 1
+        total = Color(*total) + ops.select(at_bottom, found, Color.of(0.0))
+        return after, rng, tuple(total), ops.select(at_bottom, blunt, first), detour.offer(after, rng)
+
+    zero = wo.x * 0.0
+    state = (there, rng, (zero, zero, zero), zero, _Detour(there.direction, (zero, zero, zero), zero))
+    _, _, total, _, detour = dr.while_loop(state, lambda walk, *rest: walk.alive, body, label="unscattered")
+    return Color(*total), detour.chosen()
+
+
+def _scattered(layers: Layers, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
+    """Light that scatters in the medium: at each scattering, as if it were the last, it takes the `ways` out.
+
+    A way out is a segment of a walk from wo that met interfaces only, and its throughput. However narrow the lobes on
+    it, light finds it, as the medium scatters into all directions.
+    """
+    source = Layered3()
+
+    def body(walk: Walk, rng: Random, total: tuple) -> tuple:
+        after = source.step(layers, walk, rng)
+        out = Color.of(0.0)
+        for d, reached in ways:
+            # Light takes the way backwards: from the vertex to the interface where the segment began.
+            depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
+            out = out + reached * (_transmittance(layers, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
+        found = throughput(walk) * Color(*layers.albedo) * out * _ISOTROPIC_PHASE
+        scatters = (after.height > 0) & (after.height < 1)
+        return after, rng, tuple(Color(*total) + ops.select(scatters, found, Color.of(0.0)))
+
+    zero = layers.sigma_t * 0.0
+    there = replace(there, alive=there.alive & (layers.sigma_t > 0))
+    state = (there, rng, (zero, zero, zero))
+    _, _, total = dr.while_loop(state, lambda walk, *rest: walk.alive, body, label="scattered")
+    return Color(*total)
+
+
+def _bluntness(density: Float) -> Float:
+    return 1.0 / ops.maximum(density, 1e-20)
+
+
+def _sharpness(layers: Layers, w_in: Vec3, up: Vec3) -> Float:
+    """Density about a visit to the conductor [1/sr], the same for both directions in which it can be walked."""
+    return 0.25 * ggx_d(ops.normalize(w_in + up), layers.alpha_bottom, layers.alpha_bottom)
+
+
+def _conductor_weight(layers: Layers, w_in: Vec3, up: Vec3) -> Color:
+    """What the walk is multiplied by where the conductor mirrors `w_in` into `up`."""
+    view = _above(w_in)
+    cos_m = ops.dot(view, ops.normalize(view + up))
+    tint = fresnel_conductor_rgb(cos_m, Color(*layers.eta_bottom), Color(*layers.k_bottom))
+    return tint * smith_g1(up, layers.alpha_bottom, layers.alpha_bottom)
+
+
+def _out_through_coat(layers: Layers, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
+    """(q, t): density of `up` when wo is refracted down by visible normals [1/sr], and density of wo given `up` over q.
+
+    Walter 2007, eq. 16 (half vector) and 17 (its Jacobian); in t the distribution and the Jacobian cancel.
+    """
+    alpha, eta = layers.alpha_top, layers.eta_top
+    matched = eta == 1.0
+    half = up * eta - wo
+    length2 = ops.maximum(ops.dot(half, half), 1e-20)
+    m = half * (1.0 / ops.sqrt(length2))
+    cos_o, cos_up = ops.dot(wo, m), ops.dot(up, m)
+    q = visible_normal_pdf(_above(wo), m, alpha, alpha) * (eta * eta) * cos_up / length2
+    fresnel, _ = fresnel_dielectric(ops.clip(cos_o, 0.0, 1.0), eta)
+    passes = ops.select(matched, 1.0, 1.0 - fresnel) * smith_g1(up, alpha, alpha)
+    t = passes * wo.z / (eta * eta * ops.maximum(up.z, 1e-7))
+    valid = matched | ((m.z > 0) & (cos_o > 0) & (cos_up > 0))
+    return ops.select(valid, q, 0.0), ops.select(valid, t, 0.0)
+
+
+def _mirror_pdf(w: Vec3, out: Vec3, alpha: Float) -> Float:
+    """Density of `out` when `w` is mirrored in a visible normal [1/sr]. Walter 2007, eq. 14."""
+    m = ops.normalize(w + out)
+    return visible_normal_pdf(w, m, alpha, alpha) / (4.0 * ops.maximum(ops.dot(w, m), 1e-7))
+
+
+def _above(w: Vec3) -> Vec3:
+    """`w` kept off the horizon, where visible normals are undefined."""
+    return Vec3(w.x, w.y, ops.maximum(w.z, 1e-7))
+
+
+def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
+    """Weights of the lobes of `pdf` (coat, conductor seen through it, cosine; sum 1), and the width of the second.
+
+    Tilts add in variance: a facet of the conductor shifts the tangential part of a direction by 2 cos_t times its
+    slope, one of the coat, which is crossed twice, by (eta cos_t - cos_i) / eta times its own.
+    """
+    eta, cos_i = layers.eta_top, ops.maximum(wi.z, 1e-3)
+    fresnel, cos_t = fresnel_dielectric(cos_i, eta)
+    crossing = layers.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
+    width2 = layers.alpha_bottom * layers.alpha_bottom + 2.0 * crossing * crossing
+    # Of the conductor's lobe, the coat turns back what lies beyond its critical angle; it comes out anywhere.
+    critical = 1.0 / (eta + ops.safe_sqrt(eta * eta - 1.0))
+    trapped = width2 / (width2 + critical * critical)
+    metal = _mean(fresnel_conductor_rgb(cos_t, Color(*layers.eta_bottom), Color(*layers.k_bottom)))
+    passes = (1.0 - fresnel) * ops.exp(-2.0 * layers.sigma_t / cos_t)
+    bottom = passes * metal
+    medium = (1.0 - fresnel - passes) * _mean(Color(*layers.albedo))
+    diffuse = _LEAST_DIFFUSE + 0.5 * (medium + bottom * trapped)
+    norm = 1.0 / (fresnel + bottom + diffuse)
+    width = ops.sqrt(width2)
+    return (fresnel * norm, bottom * norm, diffuse * norm), ops.clip(width, 1e-4, 1.0)
+
+
+def pdf(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
+    """A density of wo [1/sr] near the walk's, integral at most 1, positive for wo.z > 0: for weighing estimators."""
+    (coat, bottom, diffuse), width = lobes(layers, wi)
+    inside_i, inside_o = refract_flat(wi, layers.eta_top), refract_flat(wo, layers.eta_top)
+    jacobian = wo.z / (layers.eta_top * layers.eta_top * inside_o.z)
+    mirrored = coat * _mirror_pdf(_above(wi), wo, layers.alpha_top)
+    seen = bottom * _mirror_pdf(inside_i, inside_o, width) * jacobian
+    return ops.select(wo.z > 0, mirrored + seen + diffuse * ops.INV_PI * wo.z, 0.0)
+
+
+def refract_flat(w: Vec3, eta: Float) -> Vec3:
+    """Where light along `w` comes from under a flat coat of index `eta`, pointing up still (Snell's law)."""
+    x, y = w.x / eta, w.y / eta
+    return Vec3(x, y, ops.sqrt(ops.maximum(1.0 - x * x - y * y, 1e-7)))
+
+
+def _mean(c: Color) -> Float:
+    return (c.x + c.y + c.z) * (1.0 / 3.0)
