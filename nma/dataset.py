@@ -7,9 +7,10 @@ should two of them simulate one material, they write the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -40,14 +41,20 @@ class Settings:
     format: int = FORMAT
 
 
-def draw_params(settings: Settings, indices: NDArray[np.integer] | range) -> NDArray[np.float64]:
+def draw_params(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.float64]:
     """Parameter vectors of the materials `indices`, each from its own stream."""
     space = sources.get(settings.class_name).space
     rows = [np.random.default_rng((settings.seed, int(i), 0x9A7A)) for i in indices]
     return np.concatenate([space.sample(rng, 1, settings.population) for rng in rows])
 
 
-def simulate_block(settings: Settings, indices: NDArray[np.integer] | range) -> Tables:
+def _fingerprint(settings: Settings) -> str:
+    """Changes when another version of the package draws other parameters from the same seed."""
+    ends = draw_params(settings, [0, settings.materials - 1]).astype(np.float32)
+    return hashlib.sha256(ends.tobytes()).hexdigest()[:16]
+
+
+def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> Tables:
     """Parameters and tables, without errors, of the materials `indices`."""
     source = sources.get(settings.class_name)
     return tabulate(
@@ -80,7 +87,7 @@ class Dataset:
             dtype="float16",
             serializer=BytesCodec(),
             compressors=[ZstdCodec(level=1), Crc32cCodec()],
-            attributes={"nma_dataset": asdict(settings)},
+            attributes={"nma_dataset": asdict(settings), "nma_params": _fingerprint(settings)},
         )
         return Dataset(path, settings, table)
 
@@ -91,10 +98,13 @@ class Dataset:
         try:
             table = zarr.open_array(path, mode="r+")
             settings = Settings(**table.attrs["nma_dataset"])
+            fingerprint = table.attrs["nma_params"]
         except Exception as e:
             raise DatasetError(f"{path} is not a dataset of tables ({e}); `nma dataset CLASS {path}` makes one") from None
         if settings.format != FORMAT:
             raise DatasetError(f"{path} has format {settings.format}, this version reads {FORMAT}; generate it again")
+        if fingerprint != _fingerprint(settings):
+            raise DatasetError(f"{path} was made by a version that drew other parameters from its seed; generate it again")
         return Dataset(path, settings, table)
 
     def _chunk(self, index: int) -> Path:

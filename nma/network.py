@@ -11,14 +11,20 @@ from numpy.typing import NDArray
 from nma import ops
 from nma.ops import Float
 
+# Share of He's random matrix in hidden layers that start near the identity.
+_MIXING = 0.25
+
 Layers = list[tuple[Any, Any]]  # (matrix (out, in), bias (out,)) per layer
 
 
 def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | None = None) -> Layers:
-    """He 2015 initialisation; the last layer starts small around `output_bias`."""
+    """Random layers: He 2015 initialisation, with hidden layers of equal width starting near the identity, so that a
+    deep network starts out as easy to train as a shallow one; the last layer starts small around `output_bias`."""
     layers: Layers = []
     for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
         matrix = rng.standard_normal((fan_out, fan_in)) * np.sqrt(2.0 / fan_in)
+        if fan_in == fan_out:
+            matrix = np.eye(fan_in) + _MIXING * matrix
         layers.append((matrix.astype(np.float32), np.zeros(fan_out, np.float32)))
     matrix, bias = layers[-1]
     layers[-1] = (0.1 * matrix, bias if output_bias is None else np.asarray(output_bias, np.float32))

@@ -12,7 +12,7 @@ from nma.data import load_conductors
 from nma.errors import ParamError
 
 Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
-Population = Literal["mixed", "range", "metals", "held_out_metals"]
+Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
 Bounds = Literal["training", "valid"]
 
 
@@ -137,16 +137,20 @@ class ParamSpace:
         """(n, size) parameter vectors drawn by each parameter's law.
 
         For classes with a conductor, `population` chooses where (eta, k) come from: "range" draws every channel
-        uniformly, "metals" takes real metals other than those held out, "held_out_metals" takes those, and "mixed",
-        what training uses, takes half of each of the first two.
+        uniformly, "metals" takes real metals other than those held out, "held_out_metals" takes those, "mixed", what
+        training uses, takes half of each of the first two, and "unseen_metals", for tests, takes every third
+        material's from the metals held out.
         """
         out = np.concatenate([p.draw(rng, n) for p in self.params], axis=1)
         if not any(p.law == "conductor" for p in self.params) or population == "range":
             return out
         metals = load_conductors()
-        pool = np.nonzero(metals.held_out == (population == "held_out_metals"))[0]
-        pick = pool[rng.integers(len(pool), size=n)]
+        known, held_out = np.nonzero(~metals.held_out)[0], np.nonzero(metals.held_out)[0]
+        pick = known[rng.integers(len(known), size=n)]
         rows = rng.random(n) < 0.5 if population == "mixed" else np.ones(n, bool)
+        if population in ("held_out_metals", "unseen_metals"):
+            step = 1 if population == "held_out_metals" else 3
+            pick[::step] = held_out[rng.integers(len(held_out), size=len(pick[::step]))]
         out[rows, self.slices["eta_conductor"]] = metals.eta[pick[rows]]
         out[rows, self.slices["k_conductor"]] = metals.k[pick[rows]]
         return out

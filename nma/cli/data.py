@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from pathlib import Path
 from typing import Annotated
@@ -37,7 +38,7 @@ def simulate(
     params: Annotated[Path | None, typer.Option(help="A file (.npz) with `params` (n, 13), a reference file for example.")] = None,
     material: Annotated[list[str] | None, typer.Option(help="A named material or material file; may be repeated.")] = None,
     draw: Annotated[int, typer.Option(help="Draw this many materials at random instead.")] = 0,
-    population: Annotated[str, typer.Option(help="Where drawn conductors come from: mixed, range, metals, held_out_metals.")] = "mixed",
+    population: Annotated[str, typer.Option(help="Where drawn conductors come from: mixed, range, metals, held_out_metals, unseen_metals.")] = "mixed",
     class_name: Annotated[str, typer.Option("--class", help="The class of the source materials.")] = "layered3",
     walks: Annotated[int, typer.Option(help="Random walks per material.")] = 16_000_000,
     seed: Annotated[int, typer.Option(help="Seed of the walks and of the drawn materials.")] = 0,
@@ -51,15 +52,21 @@ def simulate(
 
     source = sources.get(class_name)
     vectors = _vectors(source.space, params, material, draw, population, seed)
-    parts = []
+    # Finished materials wait beside the output, so that a killed run goes on where it stopped.
+    parts = output.with_name(output.name + ".parts")
+    parts.mkdir(parents=True, exist_ok=True)
     with console.progress("Mwalks/s") as bar:
         task = bar.add_task("simulating", total=len(vectors), rate="", note="")
-        began = time.perf_counter()
+        began, simulated = time.perf_counter(), 0
         for n, vector in enumerate(vectors):
-            parts.append(tabulate(source, vector[None], walks, stream_keys(seed, range(n, n + 1))))
-            rate = (n + 1) * walks / (time.perf_counter() - began) / 1e6
+            part = parts / f"{stream_keys(seed, [n])[0]:016x}-{walks}.npz"
+            if not (part.exists() and np.array_equal(Tables.load(part).params[0], vector)):
+                tabulate(source, vector[None], walks, stream_keys(seed, [n])).save(part)
+                simulated += 1
+            rate = simulated * walks / (time.perf_counter() - began) / 1e6
             bar.update(task, completed=n + 1, rate=f"{rate:.1f}")
-    Tables.concatenate(parts).save(output)
+    Tables.concatenate([Tables.load(parts / f"{key:016x}-{walks}.npz") for key in stream_keys(seed, range(len(vectors)))]).save(output)
+    shutil.rmtree(parts)
     console.err.print(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
 
 
@@ -69,7 +76,7 @@ def dataset(
     materials: Annotated[int, typer.Option(help="Number of materials.")] = 8000,
     walks: Annotated[int, typer.Option(help="Random walks per material.")] = 819_200,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal datasets.")] = 0,
-    population: Annotated[str, typer.Option(help="mixed, range, metals or held_out_metals.")] = "mixed",
+    population: Annotated[str, typer.Option(help="mixed, range, metals, held_out_metals or unseen_metals.")] = "mixed",
 ) -> None:
     """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
     from nma.dataset import Dataset, Settings

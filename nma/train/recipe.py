@@ -12,9 +12,11 @@ from nma.errors import NmaError
 class Recipe:
     """Settings of a training run.
 
-    A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, one network pass per row, and
+    A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, and
     averages the target over `points` points per bin.
 
+    - `nodes`: passes of the network per row; 1 (the paper) keeps the target's parameters constant in the row, 2
+      interpolates them between its ends.
     - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
       one point in the middle of the bin (point supervision).
     - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
@@ -31,6 +33,7 @@ class Recipe:
     encoding: str = "layered3"
     rows: int = 512
     bins_per_row: int = 8
+    nodes: int = 2
     points: int = 8
     points_law: Literal["crowded", "uniform", "centre"] = "crowded"
     bins_law: Literal["mirror", "uniform"] = "mirror"
@@ -62,6 +65,7 @@ PAPER = Recipe(
     encoding="raw",
     rows=1000,
     bins_per_row=1,
+    nodes=1,
     points=20,
     points_law="uniform",
     bins_law="uniform",
