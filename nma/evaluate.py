@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from nma import ava, metrics, target
 from nma.adapter import Adapter
 from nma.errors import TableError
+from nma.jit import dr
 from nma.ops import Color
 from nma.table import ISOTROPIC, Grid, Tables
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from nma import ops
 from nma.errors import TableError
+from nma.jit import dr
 from nma.ops import Vec3
 from nma.sources.base import Source, Walk
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import drjit as dr
-
 from nma import ops
+from nma.jit import dr
 from nma.ops import Color, Float, Mask, Vec3
 from nma.params import ParamSpace
 

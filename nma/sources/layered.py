@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
-
 from nma import ops
+from nma.jit import dr
 from nma.microfacet import (
     fresnel_conductor_rgb,
     fresnel_dielectric,

@@ -1,0 +1,25 @@
+"""What several test files share."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from nma import llvm
+
+
+@pytest.fixture
+def old_library(tmp_path: Path) -> str:
+    """A libLLVM from before 16, which cannot tell its version: one of the system's, or an imitation."""
+    for path in llvm.candidates():
+        if llvm._version_of_name(path) < 16:
+            return path
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no old libLLVM here, and no C compiler to imitate one")
+    source = tmp_path / "old.c"
+    source.write_text("void *LLVMGetGlobalContext(void) { return 0; }\n")
+    library = tmp_path / "libLLVM-14.so.1"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source], check=True)
+    return str(library)

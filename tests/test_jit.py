@@ -1,0 +1,81 @@
+"""Dr.Jit is loaded with a libLLVM it survives, or the user learns what to do, in one line and before anything dies."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import nma
+from nma import llvm
+from nma.jit import _has_gpu
+
+needs_llvm = pytest.mark.skipif(_has_gpu(), reason="Dr.Jit computes on a GPU here and needs no libLLVM")
+SIMULATE = "from nma.cli import main; main()"
+KERNEL = """
+import os
+import numpy as np
+from nma import sources
+from nma.table import stream_keys, tabulate
+
+source = sources.get("layered3")
+params = source.space.sample(np.random.default_rng(1), 1)
+table = tabulate(source, params, 40, stream_keys(0, [0]))
+print(table.walks[0], os.environ["DRJIT_LIBLLVM_PATH"])
+"""
+
+
+def run(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
+    """Runs Python `code` in a fresh process, without this one's choice of libLLVM."""
+    kept = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE}
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, env=kept | environment, capture_output=True, text=True, timeout=60)
+
+
+@needs_llvm
+@pytest.mark.parametrize("which", ["old", "none"])
+def test_simulate_with_an_unusable_library_exits_1_with_one_line(which, old_library, tmp_path):
+    library = old_library if which == "old" else "/nowhere/libLLVM.so"
+    output = str(tmp_path / "x.npz")
+    options = ("simulate", "--material", "gold-red-lacquer", "--walks", "40", "-o", output)
+    result = run(SIMULATE, *options, DRJIT_LIBLLVM_PATH=library)
+    assert result.returncode == 1
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("nma: ")
+    assert f"unset {llvm.VARIABLE}" in result.stderr
+    assert library in result.stderr
+    assert not Path(output).exists()
+
+
+@needs_llvm
+def test_an_old_library_that_dr_jit_has_loaded_already_is_refused(old_library):
+    result = run("import drjit\nimport nma.table", DRJIT_LIBLLVM_PATH=old_library)
+    assert result.returncode == 1
+    assert re.search(r"MissingDependencyError: Dr.Jit has loaded .*; (set|run)", result.stderr)
+
+
+def test_the_choice_is_made_before_dr_jit_is_imported():
+    result = run(KERNEL)
+    assert result.returncode == 0, result.stderr
+    walks, library = result.stdout.split()
+    assert int(walks) == 40
+    assert llvm.version(library) >= llvm.MIN_VERSION
+
+
+def test_loading_dr_jit_loads_no_mitsuba():
+    result = run("import sys, nma.table, nma.evaluate, nma.sources.layered; print('mitsuba' in sys.modules)")
+    assert result.stdout == "False\n", result.stderr
+
+
+def test_modules_take_dr_jit_from_the_gate():
+    """At module level nobody imports Dr.Jit or Mitsuba itself, outside the packages whose `__init__` is a gate."""
+    root = Path(nma.__file__).parent
+    gated = ("render", "sources")
+    for path in root.rglob("*.py"):
+        if path.name == "jit.py" or path.relative_to(root).parts[0] in gated:
+            continue
+        own = re.findall(r"^(?:import|from) (?:drjit|mitsuba)\b.*", path.read_text(), re.M)
+        assert not own, f"{path}: {own}; write `from nma.jit import dr`"
