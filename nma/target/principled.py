@@ -120,7 +120,7 @@ def spec_alpha(roughness: Float, anisotropic: Float) -> tuple[Float, Float]:
 
 
 def clearcoat_alpha(clearcoat_gloss: Float) -> Float:
-    """Width of the clearcoat's GTR1 lobe, .1 to .001. Burley 2012, section 5.6."""
+    """Width of the clearcoat's GTR1 lobe, .1 to .001. Burley 2012, section 5.4."""
     return ops.lerp(0.1, 0.001, clearcoat_gloss)
 
 
@@ -135,7 +135,7 @@ def specular_eta(specular: Float) -> Float:
 
 
 def dielectric_reflectance(cos: Float, eta: Float) -> Float:
-    """Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Cook and Torrance 1982, section 4."""
+    """Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Walter 2007, eq. 22."""
     eta2 = eta * eta
     g = ops.sqrt(ops.maximum(eta2 - 1.0 + cos * cos, 1e-12))
     r_s = (cos - g) / (cos + g)
@@ -151,7 +151,7 @@ def luminance_inverse(base_color: Color) -> Float:
 def gtr1_d(m: Vec3, alpha: Float) -> Float:
     """GTR1 distribution of normals [1/sr], with 1 + (alpha^2 - 1) cos^2 written as sin^2 + alpha^2 cos^2.
 
-    Burley 2012, eq. 4.
+    Burley 2012, appendix B.
     """
     alpha2 = alpha * alpha
     e = m.x * m.x + m.y * m.y + alpha2 * m.z * m.z
