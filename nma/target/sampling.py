@@ -82,7 +82,7 @@ def sample_spec(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) 
 
 
 def sample_clearcoat(wi: Vec3, alpha: Float, u1: Float, u2: Float) -> Vec3:
-    """A reflection of `wi` about a normal drawn from GTR1 times its cosine. Burley 2012, appendix B, solved for the sine."""
+    """A reflection of `wi` about a normal drawn from GTR1 times its cosine. Burley 2012, appendix B, by its sine."""
     alpha2 = alpha * alpha
     phi = (2.0 * ops.PI) * u1
     sin2 = (ops.exp(ops.log(alpha2) * (1.0 - u2)) - alpha2) / (1.0 - alpha2)
