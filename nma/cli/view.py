@@ -2,8 +2,331 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
 import typer
+
+from nma.cli import console
+
+if TYPE_CHECKING:
+    from nma.materials import Material
+
+_Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a parameter of the material: alpha_top=.2, albedo=.9,.1,.1, conductor=Ag, sigma_t=wear.png. "
+        "May be repeated.",
+    ),
+]
+_AdapterName = Annotated[str, typer.Option(help="A shipped adapter's name or a weights file.")]
+_Clamp = Annotated[
+    bool, typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range.")
+]
+_Camera = Annotated[str, typer.Option(help="hero, close or top.")]
+_Envmap = Annotated[
+    Path | None, typer.Option(help="Light by this environment map (EXR or HDR) instead of sun, sky and lamp.")
+]
+_Size = Annotated[str, typer.Option(help="Pixels: 512 for a square, or 512x384.")]
+_Depth = Annotated[int, typer.Option(help="Longest path, in edges.")]
+_Seed = Annotated[int, typer.Option(help="Equal seeds give equal pictures.")]
+_Variant = Annotated[
+    str,
+    typer.Option(
+        help="Mitsuba's variant; auto is cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb."
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:
-    pass
+    app.command()(render)
+    app.command()(compare)
+    app.command()(demo)
+
+
+def render(
+    context: typer.Context,
+    subject: Annotated[
+        str, typer.Argument(help="A named material, a material file (.toml) or a Mitsuba scene (.xml).")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="OUT.png or OUT.exr; both are written.  [default: out/SUBJECT.png]"
+        ),
+    ] = None,
+    model: Annotated[str, typer.Option(help="nma, the adapter, or layered, the reference.")] = "nma",
+    adapter: _AdapterName = "layered3-5x64",
+    clamp: _Clamp = False,
+    changes: _Set = None,
+    camera: _Camera = "hero",
+    envmap: _Envmap = None,
+    size: Annotated[
+        str | None, typer.Option(help="Pixels: 512 for a square, or 512x384.  [default: 512, or the scene's]")
+    ] = None,
+    spp: Annotated[
+        int | None, typer.Option(help="Samples per pixel.  [default: 128, or the scene's]")
+    ] = None,
+    depth: _Depth = 6,
+    seed: _Seed = 0,
+    exposure: Annotated[float, typer.Option(help="Stops that brighten the PNG; the EXR stays linear.")] = 0.0,
+    define: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--define",
+            "-D",
+            metavar="NAME=VALUE",
+            help="A parameter ($NAME) of the XML scene. May be repeated.",
+        ),
+    ] = None,
+    variant: _Variant = "auto",
+) -> None:
+    """Render a material in the preview scene, or a Mitsuba scene as it is, to EXR and PNG.
+
+    Scenes may use the BSDFs `nma` and `layered`, which the `mitsuba` program cannot see. They bring their own material,
+    camera, light and path depth, so options for those apply to materials alone.
+
+    Examples: [bold]nma render gold-red-lacquer --camera close --set alpha_top=.05[/bold],
+    [bold]nma render my-material.toml --model layered -o out/my.exr[/bold], [bold]nma render scene.xml --spp 256[/bold]
+    """
+    files = _outputs(output or Path("out", Path(subject).stem + ".png"))
+    pixels = _pixels(size) if size else None
+    if subject.endswith(".xml"):
+        _refuse(context, _MATERIAL_ONLY, "an XML scene")
+        scene, own_spp = _load_file(subject, define, pixels, variant)
+        spp = spp or own_spp
+    else:
+        _refuse(context, ("define",), "a material")
+        view = _View(pixels or (512, 512), spp or 128, depth, camera, envmap, variant)
+        scene, spp = view.load(_material(subject, changes), model, adapter, clamp), view.spp
+    _write(_render(scene, spp, seed, subject), scene, files, exposure)
+
+
+def compare(
+    test: Annotated[str, typer.Argument(help="An image (EXR, PNG, ...), or alone: a material.")],
+    reference: Annotated[str | None, typer.Argument(help="The image to compare with.")] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="A PNG with both images and the map of their FLIP.")
+    ] = None,
+    exposure: Annotated[float, typer.Option(help="Stops before ssim, flip_ldr and in the PNG.")] = 0.0,
+    adapter: _AdapterName = "layered3-5x64",
+    clamp: _Clamp = False,
+    changes: _Set = None,
+    camera: _Camera = "hero",
+    envmap: _Envmap = None,
+    size: _Size = "256",
+    spp: Annotated[int, typer.Option(help="Samples per pixel.")] = 256,
+    depth: _Depth = 6,
+    seed: _Seed = 0,
+    variant: _Variant = "auto",
+) -> None:
+    """Compare two images; or, for a material, its adapter with its reference, both rendered in the preview scene.
+
+    A material's reference is rendered twice, and the column `noise` says what it scores against itself: its noise.
+    The figures are defined in docs/evaluation.md.
+
+    Examples: [bold]nma compare test.exr reference.exr -o difference.png[/bold],
+    [bold]nma compare gold-red-lacquer --spp 512[/bold]
+    """
+    from nma import image_metrics
+    from nma.image_io import read_image
+
+    if reference is not None:
+        pictures = {"image": read_image(test), "reference": read_image(reference)}
+    else:
+        view = _View(_pixels(size), spp, depth, camera, envmap, variant)
+        pictures = _renderings(_material(test, changes), view, seed, adapter, clamp)
+    truth = pictures.pop("reference")
+    errors = {
+        name: image_metrics.compare_images(picture, truth, ldr_exposure=exposure)
+        for name, picture in pictures.items()
+    }
+    first = next(iter(pictures))
+    if output:
+        _write_difference(output, test, first, pictures[first], truth, exposure)
+    if as_json:
+        print(json.dumps(errors[first] | ({"noise": errors["noise"]} if "noise" in errors else {})))
+        return
+    rows = [(metric, *(values[metric] for values in errors.values())) for metric in image_metrics.METRICS]
+    console.out.print(f"{test} against {reference or 'its reference'}", highlight=False)
+    console.out.print(console.table(("", *errors), rows))
+
+
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out/demo.png"),
+    adapter: _AdapterName = "layered3-5x64",
+    size: _Size = "256",
+    spp: Annotated[int, typer.Option(help="Samples per pixel of the frames that are timed.")] = 64,
+    runs: Annotated[int, typer.Option(help="Frames of each kind, with seeds of their own.")] = 4,
+    reference_spp: Annotated[int, typer.Option(help="Samples per pixel of the converged reference.")] = 1024,
+    variant: _Variant = "auto",
+) -> None:
+    """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.
+
+    Writes a sheet of pictures and prints the table below it. Takes about two minutes on two CPU cores.
+    """
+    import nma.render
+    from nma.render import demo as demonstration
+
+    settings = demonstration.Settings(_pixels(size), spp, runs, reference_spp, adapter)
+    nma.render.use(variant)
+    with _samples_bar("demo", demonstration.total_samples(settings)) as advance:
+        lines = demonstration.demo(output, settings, advance)
+    headings = demonstration.HEADINGS
+    console.out.print(console.table(headings, [line.cells() for line in lines]))
+    console.out.print(demonstration.note(settings), highlight=False)
+    console.err.print(f"[bold]{output}[/bold] shows the pictures")
+
+
+_MATERIAL_ONLY = ("model", "adapter", "clamp", "changes", "camera", "envmap", "depth")
+
+
+class _View(NamedTuple):
+    """How the preview scene is looked at."""
+
+    size: tuple[int, int]
+    spp: int
+    depth: int
+    camera: str
+    envmap: Path | None
+    variant: str
+
+    def load(self, material: Material, model: str, adapter: str = "", clamp: bool = False) -> Any:
+        """The scene with this material."""
+        import nma.render
+        from nma.render import load, scene
+
+        nma.render.use(self.variant)
+        bsdf = load.material_bsdf(material, model, adapter=adapter, clamp=clamp)
+        options: dict[str, Any] = {"camera": self.camera, "envmap": self.envmap, "max_depth": self.depth}
+        return load.load_dict(scene.preview_scene(bsdf, size=self.size, spp=self.spp, **options))
+
+
+def _load_file(
+    path: str, define: list[str] | None, size: tuple[int, int] | None, variant: str
+) -> tuple[Any, int]:
+    """A scene from an XML file, and its samples per pixel."""
+    import nma.render
+    from nma.render.load import load_scene
+
+    nma.render.use(variant)
+    scene = load_scene(path, dict(map(_assignment, define or [])), size)
+    return scene, scene.sensors()[0].sampler().sample_count()
+
+
+def _renderings(material: Material, view: _View, seed: int, adapter: str, clamp: bool) -> dict[str, Any]:
+    """A material by its adapter, by its reference, and by the reference with another seed."""
+    by_adapter = view.load(material, "nma", adapter, clamp)
+    by_walks = view.load(material, "layered")
+    return {
+        "adapter": _render(by_adapter, view.spp, seed, "adapter"),
+        "noise": _render(by_walks, view.spp, seed + 1, "reference again"),
+        "reference": _render(by_walks, view.spp, seed, "reference"),
+    }
+
+
+def _render(scene: Any, spp: int, seed: int, title: str) -> Any:
+    from nma.render.progressive import render_passes
+
+    with _samples_bar(title, spp) as advance:
+        return render_passes(scene, spp, seed=seed, progress=partial(advance, title))
+
+
+@contextmanager
+def _samples_bar(title: str, total: int):
+    """A progress bar over samples per pixel; yields a function of what goes on and the samples done."""
+    import time
+
+    with console.progress("spp/s") as bar:
+        task = bar.add_task(title, total=total, rate="", note="")
+        began = time.perf_counter()
+
+        def advance(what: str, samples: int) -> None:
+            bar.advance(task, samples)
+            rate = bar.tasks[0].completed / (time.perf_counter() - began)
+            bar.update(task, rate=f"{rate:.1f}", description=what)
+
+        yield advance
+
+
+def _write(image: Any, scene: Any, files: tuple[Path, Path], exposure: float) -> None:
+    """All channels as EXR, the colours as PNG."""
+    from nma.image_io import write_exr, write_png
+
+    layers = [layer.name for layer in scene.sensors()[0].film().bitmap().struct_()]
+    write_exr(files[0], image, layers if image.shape[2] > 4 else ())
+    colours = (
+        image[..., :3]
+        if image.shape[2] > 3
+        else image[..., :1].repeat(3, axis=2)
+        if image.shape[2] == 1
+        else image
+    )
+    write_png(files[1], colours, exposure=exposure)
+    console.err.print(f"{files[0]} (linear), {files[1]}")
+
+
+def _write_difference(path: Path, title: str, name: str, test: Any, reference: Any, exposure: float) -> None:
+    from nma.contact_sheet import Row, contact_sheet
+    from nma.image_metrics import difference_image
+
+    difference = difference_image(test, reference, kind="flip", exposure=exposure)
+    contact_sheet(
+        path, [Row(title, [reference, test, difference])], ("reference", name, "FLIP"), exposure=exposure
+    )
+    console.err.print(f"{path}: reference, {name}, and FLIP from black (0) to yellow (1)")
+
+
+def _material(name: str, changes: list[str] | None) -> Material:
+    from nma import materials
+
+    material = materials.load(name)
+    return material.changed(dict(map(_change, changes)), "--set") if changes else material
+
+
+def _change(text: str) -> tuple[str, Any]:
+    """`alpha_top=.2` and the like, as in a material file."""
+    name, value = _assignment(text)
+    try:
+        numbers = [float(part) for part in value.split(",")]
+        return name, numbers if len(numbers) > 1 else numbers[0]
+    except ValueError:
+        return name, value if name == "conductor" else {"texture": value}
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (equals and name and value):
+        raise typer.BadParameter(f"'{text}' is not of the form NAME=VALUE")
+    return name.strip(), value.strip()
+
+
+def _pixels(text: str) -> tuple[int, int]:
+    """Width and height from `512` or `512x384`."""
+    parts = text.lower().split("x")
+    if len(parts) > 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
+        raise typer.BadParameter(f"size '{text}' is neither a number of pixels nor WIDTHxHEIGHT")
+    return int(parts[0]), int(parts[-1])
+
+
+def _outputs(path: Path) -> tuple[Path, Path]:
+    """The EXR and the PNG that belong to an output file's name."""
+    if path.suffix not in (".png", ".exr"):
+        raise typer.BadParameter(f"output {path} must end in .png or .exr; both are written")
+    return path.with_suffix(".exr"), path.with_suffix(".png")
+
+
+def _refuse(context: typer.Context, names: tuple[str, ...], subject: str) -> None:
+    """An option that would do nothing is a mistake."""
+    given = [name for name in names if context.get_parameter_source(name).name == "COMMANDLINE"]  # type: ignore[union-attr]
+    if given:
+        flags = ", ".join("--set" if name == "changes" else f"--{name}" for name in given)
+        raise typer.BadParameter(f"{flags} cannot be used with {subject}")

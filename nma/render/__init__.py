@@ -1,0 +1,42 @@
+"""Rendering in Mitsuba 3. Importing this package makes its BSDFs `nma` and `layered` known there:
+
+    import mitsuba as mi
+    import nma.render
+
+    mi.set_variant("llvm_ad_rgb")
+
+They exist in the variant in use and in every one chosen later, so the order of these lines does not matter.
+"""
+
+from __future__ import annotations
+
+from nma.errors import ParamError
+from nma.jit import dr
+from nma.llvm import ensure_llvm
+from nma.render.register import register
+
+__all__ = ["use"]
+
+register()
+
+
+def use(variant: str = "auto") -> str:
+    """Choose Mitsuba's variant, and return its name.
+
+    Args:
+        variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb.
+
+    Raises:
+        ParamError: Mitsuba has no such variant.
+        MissingDependencyError: the variant needs libLLVM, and it is missing or too old.
+    """
+    import mitsuba as mi
+
+    if variant == "auto":
+        variant = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+    if variant not in mi.variants():
+        raise ParamError(f"Mitsuba has no variant {variant!r}; it has {', '.join(mi.variants())}")
+    if variant.startswith("llvm"):
+        ensure_llvm()
+    mi.set_variant(variant)
+    return variant

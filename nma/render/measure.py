@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,7 +56,13 @@ class Agreement(NamedTuple):
 
 
 def measure(
-    scene: Any, spp: int, seeds: int | Iterable[int] = 5, *, warmup: bool = True, **render_options: Any
+    scene: Any,
+    spp: int,
+    seeds: int | Iterable[int] = 5,
+    *,
+    warmup: bool = True,
+    progress: Callable[[], None] = lambda: None,
+    **render_options: Any,
 ) -> Measurement:
     """Render a loaded scene once for each seed; every run is evaluated to its end before the clock stops.
 
@@ -65,6 +71,7 @@ def measure(
         spp: samples per pixel of each run.
         seeds: how many, 0 to n - 1, or the seeds themselves; all different, at least 2.
         warmup: render once before, with another seed, so that no run pays for compilation.
+        progress: called after each run, the one for warm-up included.
         render_options: passed to `mi.render`, such as `sensor` or `integrator`.
 
     Raises:
@@ -73,7 +80,10 @@ def measure(
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if len(numbers) < 2 or len(set(numbers)) < len(numbers):
         raise ParamError(f"measure: seeds {numbers} must be at least two different ones, or their number")
-    first = render_seconds(scene, spp, max(numbers) + 1, **render_options)[1] if warmup else 0.0
+    first = 0.0
+    if warmup:
+        first = render_seconds(scene, spp, max(numbers) + 1, **render_options)[1]
+        progress()
 
     # Welford's update keeps one mean and one sum of squares, whatever the number of runs.
     times, mean, squares = [], np.zeros(()), np.zeros(())
@@ -83,6 +93,7 @@ def measure(
         mean = mean + delta / count
         squares = squares + delta * (image - mean)
         times.append(seconds)
+        progress()
     median = float(np.median(times))
     extra = max(first - median, 0.0)
     return Measurement(mean, squares / (len(numbers) - 1), len(numbers), spp, median, extra, tuple(times))

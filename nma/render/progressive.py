@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +20,7 @@ def render_passes(
     *,
     seed: int = 0,
     sensor: int = 0,
-    progress: Callable[[int, float], None] = lambda done, rate: None,
+    progress: Callable[[int], None] = lambda samples: None,
 ) -> NDArray[np.float32]:
     """Render a loaded scene in passes of equal size and average them: (height, width, channels).
 
@@ -30,7 +29,7 @@ def render_passes(
     Args:
         scene: what `mi.load_dict` or `mi.load_file` returned.
         spp: samples per pixel in total; the last pass may be smaller than the others.
-        progress: called after each pass with the samples per pixel done so far, and their number per second.
+        progress: called after each pass with its samples per pixel.
 
     Raises:
         ParamError: spp below 1.
@@ -41,12 +40,11 @@ def render_passes(
         raise ParamError(f"{spp} samples per pixel; take at least 1")
     width, height = scene.sensors()[sensor].film().crop_size()
     passes = pass_sizes(spp, int(width) * int(height))
-    began, done, total = time.perf_counter(), 0, np.zeros(())
+    total = np.zeros(())
     for number, samples in enumerate(passes):
         image = mi.render(scene, sensor=sensor, spp=samples, seed=_pass_seed(seed, number))  # type: ignore[arg-type]
         total = total + samples * np.array(image, dtype=np.float64)
-        done += samples
-        progress(done, done / (time.perf_counter() - began))
+        progress(samples)
     return (total / spp).astype(np.float32)
 
 

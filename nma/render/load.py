@@ -1,0 +1,97 @@
+"""Loading scenes, named materials and material files into Mitsuba, with errors of one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from nma.errors import NmaError, ParamError
+from nma.materials import Material, Texture
+from nma.render.scene import bitmap_texture
+
+MODELS = ("nma", "layered")
+DEFAULT_ADAPTER = "layered3-5x64"
+
+
+class SceneError(NmaError, RuntimeError):
+    """Mitsuba cannot load a scene; the message says where, and what it or our plugin found wrong."""
+
+
+def material_bsdf(
+    material: Material, model: str = "nma", *, adapter: str | Path = DEFAULT_ADAPTER, clamp: bool = False
+) -> dict[str, Any]:
+    """The Mitsuba dictionary of a source material.
+
+    Args:
+        material: from `nma.materials.load`; its textures are read and checked here.
+        model: "nma", the adapter, or "layered", the reference.
+        adapter: name of a shipped adapter or a weights file, for "nma".
+        clamp: let the adapter move parameters beyond its training range to the range, instead of refusing them.
+
+    Raises:
+        ParamError: an unknown model.
+        TextureError: a texture that cannot be read or holds forbidden values.
+    """
+    if model not in MODELS:
+        raise ParamError(f"unknown model {model!r}; take {' or '.join(MODELS)}")
+    settings = {"adapter": str(adapter), "clamp": clamp} if model == "nma" else {}
+    return {"type": model, **settings} | {name: _value(value) for name, value in material.values.items()}
+
+
+def load_dict(description: Mapping[str, Any]) -> Any:
+    """`mi.load_dict`, its errors as `SceneError`."""
+    import mitsuba as mi
+
+    try:
+        return mi.load_dict(dict(description))
+    except RuntimeError as error:
+        raise SceneError(_one_line(str(error))) from error
+
+
+def load_scene(
+    path: str | Path, define: Mapping[str, str] | None = None, size: tuple[int, int] | None = None
+) -> Any:
+    """A Mitsuba scene from an XML file.
+
+    Args:
+        define: values of the file's own parameters, `$name` in the file.
+        size: width and height in pixels, instead of the file's, of the first sensor.
+
+    Raises:
+        SceneError: there is no such file, or Mitsuba cannot load it.
+    """
+    import mitsuba as mi
+
+    if not Path(path).is_file():
+        raise SceneError(f"there is no scene file {path}")
+    try:
+        scene = mi.load_file(str(path), **dict(define or {}))  # type: ignore[arg-type]
+    except RuntimeError as error:
+        raise SceneError(_one_line(str(error))) from error
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"{path} holds no scene; its outermost element must be <scene>")
+    if not scene.sensors():
+        raise SceneError(f"{path} has no sensor; add a <sensor>")
+    if size:
+        film = mi.traverse(scene.sensors()[0].film())
+        film["size"] = size
+        film.update()
+    return scene
+
+
+def _value(value: float | tuple[float, ...] | Texture) -> Any:
+    if isinstance(value, Texture):
+        return bitmap_texture(value.read())
+    return {"type": "rgb", "value": list(value)} if isinstance(value, tuple) else value
+
+
+def _one_line(message: str) -> str:
+    """Where, and what is wrong: without lines of source code, and of a traceback of ours the error alone."""
+    message = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip())
+    message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
+    head, traceback, rest = message.partition("Traceback (most recent call last):")
+    if traceback:
+        message = head + re.sub(r"^[\w.]+: ", "", rest.strip().splitlines()[-1])
+    return " ".join(message.split())
