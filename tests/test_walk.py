@@ -4,18 +4,18 @@ Statistical tests compare means of walks with the known value by a Z-test. Each 
 `FALSE_ALARM`, shared among its comparisons by Sidak's correction; seeds are fixed, so a test that passes keeps passing.
 """
 
-import drjit as dr
 import numpy as np
 import pytest
-from drjit.auto import PCG32, Float
 from scipy.special import exp1, expn
 from scipy.stats import norm
 
+from nma.jit import dr
 from nma.ops import Vec3
 from nma.params import LAYERED3
 from nma.sources.base import walk
 from nma.sources.layered import Layered3
 
+Float, PCG32 = dr.auto.Float, dr.auto.PCG32
 FALSE_ALARM = 1e-3
 WALKS = 1 << 18
 

@@ -21,8 +21,9 @@ from nma.sources.layered import Layered3, Layers
 
 def define() -> type:
     """The plugin's class for Mitsuba's present variant."""
-    import drjit as dr
     import mitsuba
+
+    from nma.jit import dr
 
     mi: Any = mitsuba  # its types change with the variant
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import drjit as dr
-
 from nma import ops
+from nma.jit import dr
 from nma.microfacet import (
     fresnel_conductor_rgb,
     fresnel_dielectric,

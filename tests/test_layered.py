@@ -1,0 +1,205 @@
+"""Evaluation of the layered source against its own walks, and the density that weighs it.
+
+Every statistical test's chance of a false alarm is `FALSE_ALARM`, shared among its comparisons by Sidak's correction.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from nma import ops
+from nma.jit import dr
+from nma.microfacet import reflect, sample_visible_normal
+from nma.ops import Vec3
+from nma.params import LAYERED3
+from nma.sources import layered_eval
+from nma.sources.base import walk
+from nma.sources.layered import Layered3
+from nma.table import Grid, stream_keys, tabulate
+
+Float, PCG32 = dr.auto.Float, dr.auto.PCG32
+FALSE_ALARM = 1e-3
+GRID = Grid(theta_i=5, theta_o=10, phi_o=10)
+WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
+
+# Pairs of narrow and wide lobes, thin and thick media, coats that bend light a lot, little, and not at all.
+CASES = {
+    "white_coated": {"alpha_top": 0.2, "alpha_bottom": 0.4, "eta_top": 1.5, "sigma_t": 0.0, **WHITE},
+    "white_with_medium": {
+        "alpha_top": 0.2,
+        "alpha_bottom": 0.4,
+        "eta_top": 1.5,
+        "sigma_t": 1.0,
+        "albedo": 0.9,
+        **WHITE,
+    },
+    "narrow_narrow": {"alpha_top": 1e-3, "alpha_bottom": 2e-3, "eta_top": 1.5, "sigma_t": 0.3, "albedo": 0.8},
+    "narrow_wide": {"alpha_top": 1e-3, "alpha_bottom": 0.5, "eta_top": 1.7, "sigma_t": 0.3},
+    "wide_narrow": {"alpha_top": 0.3, "alpha_bottom": 1e-3, "eta_top": 1.5, "sigma_t": 0.0},
+    "wide_narrow_weak": {"alpha_top": 0.3, "alpha_bottom": 2e-3, "eta_top": 1.05, "sigma_t": 0.5},
+    "thick": {
+        "alpha_top": 0.1,
+        "alpha_bottom": 1.0,
+        "eta_top": 2.0,
+        "sigma_t": 4.0,
+        "albedo": (0.3, 0.9, 1.0),
+    },
+    "index_matched": {"alpha_top": 1e-4, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 1.0, "albedo": 0.7},
+}
+COPPER = {"eta_conductor": (0.24, 0.96, 1.18), "k_conductor": (3.9, 2.6, 2.4)}
+
+
+def vector(values):
+    return LAYERED3.vector({"albedo": (0.9, 0.5, 0.1), **COPPER, **values})
+
+
+def layers_of(values, n):
+    """The layers in n lanes; parameters are opaque, so that all materials share one kernel."""
+    columns = [dr.opaque(Float, float(c)) + dr.zeros(Float, n) for c in vector(values)]
+    return layered_eval.settle(Layered3().gather(columns))
+
+
+def direction(cos_theta):
+    return Vec3(ops.safe_sqrt(1.0 - cos_theta * cos_theta), cos_theta * 0.0, cos_theta)
+
+
+def fixed(mu, n):
+    return direction(dr.opaque(Float, mu) + dr.zeros(Float, n))
+
+
+def draw(layers, wi, rng):
+    """A wo from each lobe of `layered_eval.pdf` in proportion to its weight; z < 0 where the lobe gives none."""
+    (coat, bottom, _), width = layered_eval.lobes(layers, wi)
+    u, u1, u2 = (rng.next_float32() for _ in range(3))
+    # Mirrored in the coat's facets, or below the coat in facets of the conductor's apparent width and refracted out.
+    upper = u < coat
+    view = ops.select(upper, wi, layered_eval.refract_flat(wi, layers.eta_top))
+    alpha = dr.select(upper, layers.alpha_top, width)
+    out = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
+    x, y = out.x * layers.eta_top, out.y * layers.eta_top
+    z2 = 1.0 - x * x - y * y
+    refracted = Vec3(x, y, dr.select((out.z > 0) & (z2 > 0), ops.safe_sqrt(z2), -1.0))
+    r, phi = dr.sqrt(u1), 2.0 * np.pi * u2
+    cosine = Vec3(r * dr.cos(phi), r * dr.sin(phi), ops.safe_sqrt(1.0 - u1))
+    return ops.select(u < coat + bottom, ops.select(upper, out, refracted), cosine)
+
+
+def estimates(layers, wi, rng):
+    """(wo, f cos(theta_o) / density) for one wo per lane, drawn by the lobes."""
+    wo = draw(layers, wi, rng)
+    pdf = layered_eval.pdf(layers, wi, wo)
+    value = layered_eval.evaluate(layers, wi, wo, rng, wo.z > 0)
+    weight = ops.select((wo.z > 0) & (pdf > 0), value * (1.0 / dr.maximum(pdf, 1e-30)), ops.Color.of(0.0))
+    return wo, np.array([c.numpy() for c in weight], np.float64)
+
+
+def limit(comparisons):
+    """The |z| beyond which one of so many two-sided Z-tests rejects."""
+    return norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / comparisons)))
+
+
+def evaluated_table(values, per_row, seed):
+    """Bin averages (theta_i, theta_o, phi, 3) by evaluation, and their standard errors."""
+    row = dr.arange(dr.auto.UInt32, GRID.theta_i * per_row) // per_row
+    rng = PCG32(dr.width(row), seed)
+    layers = layers_of(values, dr.width(row))
+    wi = direction((Float(row) + rng.next_float32()) * (1.0 / GRID.theta_i))
+    wo, weight = estimates(layers, wi, rng)
+    o = np.minimum(np.maximum(wo.z.numpy(), 0.0) * GRID.theta_o, GRID.theta_o - 1).astype(int)
+    p = np.minimum(
+        np.abs(np.arctan2(wo.y.numpy(), wo.x.numpy())) / np.pi * GRID.phi_o, GRID.phi_o - 1
+    ).astype(int)
+    index = (row.numpy() * GRID.theta_o + o) * GRID.phi_o + p
+    scale = 1.0 / (per_row * GRID.solid_angle)
+    sums, squares = (
+        np.stack([np.bincount(index, w, GRID.bins) for w in weight**power], axis=-1).reshape(GRID.shape)
+        for power in (1, 2)
+    )
+    return sums * scale, np.sqrt(squares - sums**2 / per_row) * scale
+
+
+def compare(values, seed, factor=1.0):
+    """z of every bin that at least 100 walks reached and of every row's sum, evaluation (times `factor`) over walks."""
+    walks = tabulate(Layered3(), vector(values)[None], 1 << 20, stream_keys(seed, range(1)), grid=GRID)
+    found, error = evaluated_table(values, 1 << 17, seed)
+    enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
+    difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2
+    # Bins exclude each other, so adding up their variances overrates that of the sum.
+    rows = difference.sum(axis=(1, 2)) / np.sqrt(variance.sum(axis=(1, 2)))
+    return np.concatenate([difference[enough] / np.sqrt(variance[enough]), rows.ravel()])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_evaluation_equals_walks(case):
+    """In every bin from the mirror direction to grazing; the furthest bins of narrow lobes get no walks to count."""
+    z = compare(CASES[case], seed=3)
+    assert z.size > 0.2 * GRID.bins
+    assert np.abs(z).max() < limit(z.size), f"z {np.abs(z).max():.1f} beyond {limit(z.size):.1f}"
+
+
+def test_evaluation_equals_walks_of_random_materials():
+    params = LAYERED3.sample(np.random.default_rng(11), 6)
+    named = [{p.name: row[LAYERED3.slices[p.name]] for p in LAYERED3.params} for row in params]
+    z = np.concatenate([compare(values, seed) for seed, values in enumerate(named)])
+    assert np.abs(z).max() < limit(z.size), f"z {np.abs(z).max():.1f} beyond {limit(z.size):.1f}"
+
+
+def test_comparison_would_see_two_percent():
+    z = compare(CASES["white_with_medium"], seed=3, factor=1.02)
+    assert np.abs(z).max() > limit(z.size)
+
+
+def test_integral_of_rough_coat_over_white_conductor():
+    """The case in which two public codes' evaluation and walks disagree: .556 at cos(theta_i) = .9, to three digits."""
+    n = 1 << 20
+    _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), PCG32(n, 5))
+    error = weight.std() / np.sqrt(n)
+    assert abs(weight[0].mean() - 0.556) < 0.0005 + limit(1) * error
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_reciprocity(case):
+    """f(wi, wo) = f(wo, wi), in pairs of directions off the mirror."""
+    n = 1 << 15
+    layers = layers_of(CASES[case], n)
+    for a, b in ((0.9, 0.8), (0.3, 0.95)):
+        wi, wo = fixed(a, n), fixed(b, n)
+        turned = Vec3(-0.6 * wo.x, 0.8 * wo.x, wo.z)
+        forth = np.array(layered_eval.evaluate(layers, wi, turned, PCG32(n, 1)).x.numpy(), np.float64) / b
+        back = np.array(layered_eval.evaluate(layers, turned, wi, PCG32(n, 2)).x.numpy(), np.float64) / a
+        error = np.hypot(forth.std(), back.std()) / np.sqrt(n)
+        assert abs(forth.mean() - back.mean()) < limit(2) * error + 1e-6
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_density_follows_the_walk(case):
+    """What walks and lobes draw has density, and estimates weighed by it vary little."""
+    n = 1 << 16
+    layers = layers_of(CASES[case], n)
+    for mu in (1.0, 0.6, 0.05):
+        wi = fixed(mu, n)
+        wo, _ = walk(Layered3(), layers, wi, PCG32(n, 1))
+        pdf = layered_eval.pdf(layers, wi, wo).numpy()
+        assert (pdf[wo.z.numpy() > 0] > 0).all()
+        drawn = draw(layers, wi, PCG32(n, 2))
+        assert (drawn.z.numpy() > 0).mean() > 0.55
+        _, weight = estimates(layers, wi, PCG32(n, 3))
+        assert weight.std() < 4.0 * weight.mean() + 0.5
+
+
+def test_density_by_quadrature():
+    """A fine grid over the hemisphere; the drawn share of each part of it is its integral."""
+    for values in (CASES["white_with_medium"], CASES["thick"], {**CASES["narrow_wide"], "alpha_top": 0.1}):
+        for mu in (0.9, 0.3):
+            n_z, n_phi = 512, 1024
+            i = dr.arange(dr.auto.UInt32, n_z * n_phi)
+            z, phi = (Float(i // n_phi) + 0.5) / n_z, (Float(i % n_phi) + 0.5) * (2.0 * np.pi / n_phi)
+            r = dr.sqrt(1.0 - z * z)
+            wo, wi = Vec3(r * dr.cos(phi), r * dr.sin(phi), z), fixed(mu, n_z * n_phi)
+            layers = layers_of(values, n_z * n_phi)
+            pdf = layered_eval.pdf(layers, wi, wo).numpy().reshape(n_z, n_phi) * (2.0 * np.pi / (n_z * n_phi))
+            drawn = draw(layers, wi, PCG32(n_z * n_phi, 7)).z.numpy()
+            shares = pdf.reshape(8, -1).sum(axis=1)
+            counts = np.histogram(drawn, 8, (0.0, 1.0))[0] / drawn.size
+            assert pdf.sum() < 1.001
+            np.testing.assert_allclose(counts, shares, atol=5.0 / np.sqrt(drawn.size))
