@@ -2,13 +2,15 @@
 
 Isotropic tables have shape (n, theta_i, theta_o, phi, 3): bins uniform in cos(theta_i) and cos(theta_o), index 0 at
 grazing, and in the azimuth between wi and wo folded to [0, pi], mirror direction last. Anisotropic ones have shape
-(n, theta_i, phi_i, theta_o, phi_o, 3) with azimuths over [0, 2 pi). A value is the mean of f cos(theta_o) over its bin [1/sr].
+(n, theta_i, phi_i, theta_o, phi_o, 3) with azimuths over [0, 2 pi). A value is the mean of f cos(theta_o) over its
+bin [1/sr].
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +28,8 @@ from nma.sources.base import Source, Walk
 _UNIT = 65536.0
 # So many walks of one row fit one 32-bit bin, all of them with throughput 1.
 _WALKS_PER_ROW = 65535
-# Bins times walks of one launch: bounds the memory of a launch, not its result.
-_BINS_PER_LAUNCH = 1 << 25
+# Bins that one launch counts in, over all of its materials: bounds the memory, has no influence on the result.
+_BINS_PER_LAUNCH = 1 << 21
 
 
 @dataclass(frozen=True)
@@ -84,17 +86,24 @@ class Tables:
     @staticmethod
     def concatenate(parts: Sequence[Tables]) -> Tables:
         """One after the other; all of them with errors, or none."""
-        fields = [np.concatenate([getattr(t, f) for t in parts]) for f in ("params", "values", "walks")]
-        error = None if parts[0].error is None else np.concatenate([t.error for t in parts])
-        return Tables(*fields, error)
+        errors = [t.error for t in parts if t.error is not None]
+        if errors and len(errors) < len(parts):
+            raise TableError("some of the tables have standard errors, others have none")
+        return Tables(
+            np.concatenate([t.params for t in parts]),
+            np.concatenate([t.values for t in parts]),
+            np.concatenate([t.walks for t in parts]),
+            np.concatenate(errors) if errors else None,
+        )
 
     def save(self, path: str | Path) -> None:
         """Writes the reference-file format of CONVENTIONS.md, atomically."""
         path = Path(path)
-        partial = path.with_name(path.name + ".partial")
-        arrays = {"params": self.params, "table": self.values, "walks": self.walks}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = {"params": self.params, "table": self.values, "walks": self.walks}
         if self.error is not None:
             arrays["error"] = self.error
+        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
         with partial.open("wb") as f:
             np.savez_compressed(f, **arrays)
         partial.replace(path)
@@ -104,86 +113,117 @@ class Tables:
         """Reads a reference file; `TableError` says what is wrong with it."""
         path = Path(path)
         try:
-            with np.load(path) as f:
+            with path.open("rb") as file, np.load(file) as f:
                 params, values, walks = f["params"], f["table"], f["walks"]
                 error = f["error"] if "error" in f else None
         except FileNotFoundError:
             raise TableError(f"{path}: no such file; `nma simulate` writes reference files") from None
         except (KeyError, ValueError, OSError, EOFError) as e:
-            raise TableError(f"{path}: not a reference file (.npz with params, table and walks): {e}") from None
+            raise TableError(
+                f"{path}: not a reference file (.npz with params, table and walks): {e}"
+            ) from None
         except Exception as e:  # zipfile and zlib raise their own kinds for damaged archives
             raise TableError(f"{path}: damaged archive: {e}") from None
-        n = params.shape[0]
-        if params.ndim != 2 or values.ndim not in (5, 6) or values.shape[0] != n or values.shape[-1] != 3:
-            raise TableError(f"{path}: params {params.shape} and table {values.shape} do not belong together")
-        if error is not None and error.shape != values.shape:
-            raise TableError(f"{path}: error has shape {error.shape}, table has {values.shape}")
-        if not np.isfinite(values).all():
-            raise TableError(f"{path}: table of material {int(np.argwhere(~np.isfinite(values))[0][0])} is not finite")
-        return Tables(params, values, np.broadcast_to(walks, (n,)).astype(np.int64), error)
+        _check_arrays(path, params, values, walks, error)
+        walks = np.broadcast_to(walks, len(params)).astype(np.int64)
+        return Tables(params.astype(np.float64), values, walks, error)
+
+
+def _check_arrays(
+    path: Path, params: NDArray, values: NDArray, walks: NDArray, error: NDArray | None
+) -> None:
+    """Refuses arrays that are no reference file, naming the first fault."""
+    n = len(params) if params.ndim else 0
+    arrays = {"params": params, "table": values, "walks": walks} | ({} if error is None else {"error": error})
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise TableError(f"{path}: {name} holds {array.dtype}, not numbers")
+    if params.ndim != 2 or values.ndim not in (5, 6) or values.shape[0] != n or values.shape[-1] != 3:
+        raise TableError(f"{path}: params {params.shape} and table {values.shape} do not belong together")
+    if error is not None and error.shape != values.shape:
+        raise TableError(f"{path}: error has shape {error.shape}, table has {values.shape}")
+    if walks.shape not in ((), (1,), (n,)) or not (walks > 0).all():
+        raise TableError(f"{path}: walks must be one positive number, or {n}; it has shape {walks.shape}")
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise TableError(f"{path}: {name} of material {row} is not finite; simulate it again")
 
 
 def tabulate(
-    source: Source, params: NDArray[np.float64], walks: int, keys: NDArray[np.uint64], *, grid: Grid = ISOTROPIC, error: bool = True
+    source: Source,
+    params: NDArray[np.float64],
+    walks: int,
+    keys: NDArray[np.uint64],
+    *,
+    grid: Grid = ISOTROPIC,
+    error: bool = True,
 ) -> Tables:
     """Tables of `params` (n, columns) from at least `walks` walks each.
 
-    `keys` (n,) seed the materials' random streams: equal key, equal table, whatever else is in the call (`stream_keys`).
+    `keys` (n,), from `stream_keys`, seed the materials' random streams: equal key, equal table, whatever else is in the
+    call. Without `error` no standard errors are counted, which takes half of the memory. Raises `ParamError` for
+    parameters that are not physically valid.
     """
     params = source.space.check(params)
+    if walks < 1 or len(keys) != len(params):
+        raise TableError(
+            f"cannot tabulate {len(params)} material(s) from {walks} walks each with {len(keys)} key(s)"
+        )
     total = grid.walks(walks)
-    sums = np.zeros((len(params), grid.bins, 3), np.float64)
-    squares = np.zeros_like(sums) if error else None
-    for launch in _launches(len(params), total // grid.rows, grid):
-        counts = _launch(source, params[launch.materials], keys[launch.materials], launch, grid, error)
-        sums[launch.materials] += counts[0]
-        if squares is not None:
-            squares[launch.materials] += counts[1]
-    per_row = total // grid.rows
-    values = sums / (per_row * grid.solid_angle)
+    values = np.empty((len(params), grid.bins, 3), np.float32)
+    standard_error = np.empty_like(values) if error else None
+    group = max(1, _BINS_PER_LAUNCH // grid.bins)
+    for first in range(0, len(params), group):
+        part = slice(first, first + group)
+        values[part], part_error = _tabulate_group(
+            source, params[part], keys[part], total // grid.rows, grid, error
+        )
+        if standard_error is not None:
+            standard_error[part] = part_error
     shape = (len(params), *grid.shape)
-    standard_error = None
-    if squares is not None:
-        variance = np.maximum(squares - sums * sums / per_row, squares / per_row)
-        standard_error = (np.sqrt(variance) / (per_row * grid.solid_angle)).astype(np.float32).reshape(shape)
-    values = values.astype(np.float32).reshape(shape)
-    return Tables(params, values, np.full(len(params), total, np.int64), standard_error)
+    if standard_error is not None:
+        standard_error = standard_error.reshape(shape)
+    return Tables(params, values.reshape(shape), np.full(len(params), total, np.int64), standard_error)
 
 
 def stream_keys(seed: int, indices: NDArray[np.integer] | range) -> NDArray[np.uint64]:
     """Random-stream keys of materials: each depends on the seed and the material's own index alone."""
-    return np.array([np.random.SeedSequence((seed, int(i), 0x77A1)).generate_state(1, np.uint64)[0] for i in indices])
+    return np.array(
+        [np.random.SeedSequence((seed, int(i), 0x77A1)).generate_state(1, np.uint64)[0] for i in indices]
+    )
 
 
-@dataclass(frozen=True)
-class _Launch:
-    """One kernel launch: which materials, and which of the equal sweeps over all rows."""
+def _tabulate_group(
+    source: Source, params: NDArray, keys: NDArray, sweeps: int, grid: Grid, error: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Values and standard errors (n, bins, 3) from so many sweeps over all rows, in launches that overflow no bin."""
+    moments = np.zeros((2 if error else 1, len(params), grid.bins, 3))
+    for first in range(0, sweeps, _WALKS_PER_ROW):
+        moments += _launch(source, params, keys, first, min(_WALKS_PER_ROW, sweeps - first), grid, error)
+    weight = sweeps * grid.solid_angle
+    if not error:
+        return moments[0] / weight, None
+    sums, squares = moments
+    # Where every walk hits the bin alike, take the variance of a single hit.
+    variance = np.maximum(squares - sums * sums / sweeps, squares / sweeps)
+    return sums / weight, np.sqrt(variance) / weight
 
-    materials: slice
-    first: int
-    sweeps: int
 
-
-def _launches(n: int, sweeps: int, grid: Grid) -> Iterator[_Launch]:
-    """Splits the work so that no bin overflows and a launch's tables fit in memory."""
-    group = max(1, _BINS_PER_LAUNCH // grid.bins)
-    for m in range(0, n, group):
-        for first in range(0, sweeps, _WALKS_PER_ROW):
-            yield _Launch(slice(m, min(m + group, n)), first, min(_WALKS_PER_ROW, sweeps - first))
-
-
-def _launch(source: Source, params: NDArray, keys: NDArray, launch: _Launch, grid: Grid, error: bool) -> NDArray:
-    """Sums of throughputs and of their squares (1 or 2, n, bins, 3) in units of throughput."""
+def _launch(
+    source: Source, params: NDArray, keys: NDArray, first: int, sweeps: int, grid: Grid, error: bool
+) -> NDArray:
+    """Sums of throughputs and, for the error, of their squares (1 or 2, n, bins, 3) over the sweeps from `first` on."""
     Float, UInt32, UInt64 = dr.auto.Float, dr.auto.UInt32, dr.auto.UInt64
-    n = len(params)
-    thread = dr.arange(UInt32, n * launch.sweeps * max(grid.phi_i, 1))
-    material = thread // dr.opaque(UInt32, launch.sweeps * max(grid.phi_i, 1))
-    sweep = thread - material * dr.opaque(UInt32, launch.sweeps * max(grid.phi_i, 1))
+    n, sweeps, first = len(params), sweeps * max(grid.phi_i, 1), first * max(grid.phi_i, 1)
+    thread = dr.arange(UInt32, n * sweeps)
+    material = thread // dr.opaque(UInt32, sweeps)
+    sweep = thread - material * dr.opaque(UInt32, sweeps)
     columns = [dr.gather(Float, Float(np.ascontiguousarray(c, np.float32)), material) for c in params.T]
     gathered = source.gather(columns)
     key = dr.gather(UInt64, UInt64(keys), material)
     # A sweep's stream is a function of its material's key and its own number.
-    number = UInt64(sweep) + dr.opaque(UInt64, launch.first * max(grid.phi_i, 1))
+    number = UInt64(sweep) + dr.opaque(UInt64, first)
     rng = dr.auto.PCG32(1, _mix(key ^ (number * 0x9E3779B97F4A7C15)), _mix(key + number))
     counters = [dr.zeros(UInt32, n * grid.bins * 3) for _ in range(2 if error else 1)]
     phi_row = sweep % grid.phi_i if grid.phi_i else UInt32(0)
@@ -209,7 +249,9 @@ class _State:
     phi: Any
 
 
-def _sweep(source: Source, params: Any, rng: Any, offset: Any, phi_row: Any, counters: list[Any], grid: Grid) -> None:
+def _sweep(
+    source: Source, params: Any, rng: Any, offset: Any, phi_row: Any, counters: list[Any], grid: Grid
+) -> None:
     """One walk from every row of theta_i, in every lane, counted in the table at `offset`."""
     UInt32 = dr.auto.UInt32
 
