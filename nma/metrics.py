@@ -6,14 +6,24 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 # Keeps relative errors finite in dark bins [1/sr].
 EPS = 1e-2
-# Equally likely values of a standard normal variable, for the noise floor.
-_NORMAL = np.array([0.0392, 0.1181, 0.1978, 0.2793, 0.3634, 0.4511, 0.5436, 0.6425, 0.7500, 0.8694, 1.0061, 1.1700, 1.3830, 1.7317])
+
+
+def _normal_means(n: int) -> NDArray[np.float64]:
+    """Means of a standard normal variable over `n` equally likely intervals of its positive half."""
+    normal = NormalDist()
+    densities = [normal.pdf(normal.inv_cdf(0.5 + 0.5 * k / n)) for k in range(n)] + [0.0]
+    return -2.0 * n * np.diff(densities)
+
+
+# The values of a normal variable for the noise floor: their mean magnitude is exactly that of the variable.
+_NORMAL = _normal_means(16)
 
 FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")
 
