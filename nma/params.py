@@ -1,9 +1,9 @@
-"""Parameters of source materials: one declaration per class drives sampling, inputs, textures, options, docs and exports."""
+"""Parameters of source materials: one declaration per class drives sampling, inputs, textures, options and exports."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -79,7 +79,9 @@ class ParamSpace:
         for p in self.params:
             if p.name == name:
                 return p
-        raise ParamError(f"class {self.name} has no parameter '{name}'; it has {', '.join(p.name for p in self.params)}")
+        raise ParamError(
+            f"class {self.name} has no parameter '{name}'; it has {', '.join(p.name for p in self.params)}"
+        )
 
     def vector(self, values: dict[str, ArrayLike]) -> NDArray[np.float64]:
         """A vector (size,) from named values; a number given for an RGB parameter means grey."""
@@ -89,51 +91,63 @@ class ParamSpace:
             raise ParamError(
                 f"class {self.name}: "
                 + "; ".join(
-                    [f"unknown parameter '{u}'" for u in sorted(unknown)] + [f"missing parameter '{m}'" for m in missing]
+                    [f"unknown parameter '{u}'" for u in sorted(unknown)]
+                    + [f"missing parameter '{m}'" for m in missing]
                 )
             )
         out = np.empty(self.size)
         for name, columns in self.slices.items():
-            value = np.asarray(values[name], np.float64)
+            try:
+                value = np.asarray(values[name], np.float64)
+            except (TypeError, ValueError):
+                raise ParamError(f"{name} wants number(s), got {values[name]!r}") from None
             if value.ndim > 1 or value.size not in (1, columns.stop - columns.start):
-                raise ParamError(f"{name} wants {columns.stop - columns.start} number(s), got shape {value.shape}")
+                raise ParamError(
+                    f"{name} wants {columns.stop - columns.start} number(s), got shape {value.shape}"
+                )
             out[columns] = value
         return out
 
     def check(self, params: ArrayLike, bounds: Bounds = "valid", clamp: bool = False) -> NDArray[np.float64]:
-        """Returns `params` as float64 (n, size), or raises `ParamError` that names the first fault.
+        """Returns `params` as float64 (n, size) within the bounds, or raises `ParamError` that names the first fault.
 
-        With `clamp`, values beyond the bounds are moved to them instead; what is not finite is refused all the same.
+        Values beyond a bound by no more than a rounding error are moved to it; with `clamp` all are, but what is not
+        finite is refused all the same.
         """
         p = np.atleast_2d(np.asarray(params, np.float64))
         if p.ndim != 2 or p.shape[1] != self.size:
-            raise ParamError(f"parameters of class {self.name} have shape (n, {self.size}), got {np.shape(params)}")
+            raise ParamError(
+                f"parameters of class {self.name} have shape (n, {self.size}), got {np.shape(params)}"
+            )
         for param in self.params:
             columns = self.slices[param.name]
             low, high = param.bounds(bounds)
             values = p[:, columns]
-            tolerance = 1e-6 * (high - low) if np.isfinite(high) else 0.0
+            tolerance = 1e-6 * (high - low) if np.isfinite(high) else 1e-6
             bad = ~np.isfinite(values)
             if not clamp:
                 bad |= (values < low - tolerance) | (values > high + tolerance)
             if bad.any():
                 row = int(np.nonzero(bad.any(axis=1))[0][0])
-                hint = f"; an adapter only knows its {bounds} range, clamp to it if that is meant" if bounds == "training" else ""
+                hint = (
+                    f"; an adapter only knows its {bounds} range, clamp to it if that is meant"
+                    if bounds == "training"
+                    else ""
+                )
                 raise ParamError(
                     f"{param.name} ({param.symbol}) of material {row} is {values[row].tolist()}, "
                     f"allowed is {low:g} .. {high:g}{hint}"
                 )
-        if clamp:
-            low, high = self.columns(bounds)
-            p = np.clip(p, low, high)
-        return p
+        return np.clip(p, *self.columns(bounds))
 
     def columns(self, bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper bound of every column."""
         pairs = np.array([p.bounds(bounds) for p in self.params for _ in range(p.size)])
         return pairs[:, 0], pairs[:, 1]
 
-    def sample(self, rng: np.random.Generator, n: int, population: Population = "mixed") -> NDArray[np.float64]:
+    def sample(
+        self, rng: np.random.Generator, n: int, population: Population = "mixed"
+    ) -> NDArray[np.float64]:
         """(n, size) parameter vectors drawn by each parameter's law.
 
         For classes with a conductor, `population` chooses where (eta, k) come from: "range" draws every channel
@@ -141,6 +155,10 @@ class ParamSpace:
         training uses, takes half of each of the first two, and "unseen_metals", for tests, takes every third
         material's from the metals held out.
         """
+        if population not in get_args(Population):
+            raise ParamError(
+                f"unknown population '{population}'; known are {', '.join(get_args(Population))}"
+            )
         out = np.concatenate([p.draw(rng, n) for p in self.params], axis=1)
         if not any(p.law == "conductor" for p in self.params) or population == "range":
             return out
@@ -164,10 +182,34 @@ LAYERED3 = ParamSpace(
         Param("alpha_top", "alpha_1", "log10", 1e-3, 10**-0.5, 1e-4, 1.0, "microfacet width of the coat"),
         Param("alpha_bottom", "alpha_2", "log10", 1e-3, 1.0, 1e-4, 1.0, "microfacet width of the conductor"),
         Param("eta_top", "eta_1", "uniform", 1.05, 2.0, 1.0, 4.0, "refractive index of the coat"),
-        Param("eta_conductor", "eta", "conductor", 0.03, 7.6, 0.0, _INF, "real part of the conductor's index", 3),
-        Param("k_conductor", "kappa", "conductor", 0.0, 9.5, 0.0, _INF, "imaginary part of the conductor's index", 3),
-        Param("albedo", "rho", "one_minus_square", 0.0, 1.0, 0.0, 1.0, "single-scattering albedo of the medium", 3),
-        Param("sigma_t", "sigma_t", "uniform", 0.0, 1.0, 0.0, _INF, "optical depth of the medium (thickness 1)"),
+        Param(
+            "eta_conductor", "eta", "conductor", 0.03, 7.6, 0.0, _INF, "real part of the conductor's index", 3
+        ),
+        Param(
+            "k_conductor",
+            "kappa",
+            "conductor",
+            0.0,
+            9.5,
+            0.0,
+            _INF,
+            "imaginary part of the conductor's index",
+            3,
+        ),
+        Param(
+            "albedo",
+            "rho",
+            "one_minus_square",
+            0.0,
+            1.0,
+            0.0,
+            1.0,
+            "single-scattering albedo of the medium",
+            3,
+        ),
+        Param(
+            "sigma_t", "sigma_t", "uniform", 0.0, 1.0, 0.0, _INF, "optical depth of the medium (thickness 1)"
+        ),
     ),
 )
 
