@@ -7,5 +7,6 @@ try:
     import optax  # noqa: F401
 except ImportError as e:
     raise MissingDependencyError(
-        f"training needs JAX and optax ({e.name} is missing); install them with: pip install 'neural-material-adapter[train]'"
+        f"training needs JAX and optax ({e.name} is missing); "
+        "install them with: pip install 'neural-material-adapter[train]'"
     ) from None

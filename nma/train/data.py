@@ -15,14 +15,11 @@ from nma.table import ISOTROPIC, Grid, Tables
 from nma.train.recipe import Recipe
 
 
-_OVERHANG = 0.2
-
-
 class Batch(NamedTuple):
     """Bins of one step; rows come last so that everything per row broadcasts along contiguous memory."""
 
     columns: NDArray[np.float32]  # (parameters, rows)
-    mu: NDArray[np.float32]  # (nodes, rows) cosines at which the network runs
+    mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs, anywhere in the row
     i: NDArray[np.float32]  # (rows,) bin of cos(theta_i)
     o: NDArray[np.float32]  # (bins_per_row, rows)
     p: NDArray[np.float32]  # (bins_per_row, rows)
@@ -91,7 +88,7 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
     f32 = np.float32
     return Batch(
         np.ascontiguousarray(pool.params[m].T),
-        _nodes(rng, i, recipe, pool.grid).astype(f32),
+        ((i + rng.random(recipe.rows)) / pool.grid.theta_i).astype(f32),
         i.astype(f32),
         o.astype(f32),
         p.astype(f32),
@@ -100,15 +97,6 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
         np.moveaxis(pool.values[m, i, o, p], -1, 0).astype(f32),
         (pool.grid.theta_i / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
     )
-
-
-def _nodes(rng: np.random.Generator, i: NDArray, recipe: Recipe, grid: Grid) -> NDArray:
-    """Cosines (nodes, rows) for the network: one anywhere in the row, or one near each of its ends."""
-    u = rng.random((recipe.nodes, len(i)))
-    if recipe.nodes == 2:
-        # A little beyond the ends, so that the network is not trained at the same 41 cosines only.
-        u = np.stack([-_OVERHANG * u[0], 1.0 + _OVERHANG * u[1]])
-    return np.clip((i + u) / grid.theta_i, 0.0, 1.0)
 
 
 def batches(source: Callable[[int], Batch], start: int, stop: int, group: int) -> Iterator[tuple[int, Batch]]:
@@ -129,4 +117,3 @@ def batches(source: Callable[[int], Batch], start: int, stop: int, group: int) -
         if isinstance(item, BaseException):
             raise item
         yield item
-

@@ -106,7 +106,9 @@ def result(run: Run, recipe: Recipe) -> Layers:
 
 def _schedule(recipe: Recipe) -> optax.Schedule:
     if recipe.schedule == "onecycle":
-        return optax.cosine_onecycle_schedule(recipe.steps, recipe.learning_rate, pct_start=0.1, div_factor=10, final_div_factor=100)
+        return optax.cosine_onecycle_schedule(
+            recipe.steps, recipe.learning_rate, pct_start=0.1, div_factor=10, final_div_factor=100
+        )
     return optax.constant_schedule(recipe.learning_rate)
 
 
@@ -163,6 +165,8 @@ def resume(recipe: Recipe, layers: Layers, path: Path) -> Run:
         raise NmaError(f"{path}: damaged checkpoint ({e}); delete it to start again") from None
     if notes["recipe"] != asdict(recipe):
         changed = [k for k, v in asdict(recipe).items() if notes["recipe"].get(k) != v]
-        raise NmaError(f"{path} belongs to a run with other settings ({', '.join(changed)}); delete it, or restore them")
+        raise NmaError(
+            f"{path} belongs to a run with other settings ({', '.join(changed)}); delete it, or restore them"
+        )
     state = jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(x) for x in leaves])
     return Run(state, notes["step"], losses, log_losses, notes["seconds"], notes["scale"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from nma import ava, encoding, network, ops, target
+from nma import ava, encoding, network, target
 from nma.network import Layers
 from nma.train.data import Batch
 from nma.train.recipe import Recipe
@@ -15,26 +15,13 @@ _TOLERANCE = 0.003
 
 
 def bin_means(layers: Layers, batch: Batch, recipe: Recipe) -> jax.Array:
-    """The target's mean over each bin, (3, bins_per_row, rows)."""
-    points = _points(batch, recipe)
-    numbers = _numbers(layers, batch, recipe)
-    if recipe.nodes == 2:
-        # Between the two ends of the row, the target's numbers are interpolated to each point's own wi.
-        t = (points.wi.z - batch.mu[0]) / (batch.mu[1] - batch.mu[0])
-        numbers = [ops.lerp(low, high, t) for low, high in numbers]
-    else:
-        numbers = [n[0] for n in numbers]
-    value = target.eval(target.from_numbers(numbers), points.wi, points.wo)
-    return jnp.stack([(c * points.weight).mean(axis=0) for c in value])
-
-
-def _numbers(layers: Layers, batch: Batch, recipe: Recipe) -> list[jax.Array]:
-    """The target's numbers, each (nodes, rows), from one pass of the network per node."""
-    columns = [jnp.broadcast_to(c, batch.mu.shape) for c in batch.columns]
-    inputs = encoding.get(recipe.encoding)(columns, batch.mu if recipe.directional else None)
+    """The target's mean over each bin, (3, bins_per_row, rows), for one pass of the network per row."""
+    inputs = encoding.get(recipe.encoding)(list(batch.columns), batch.mu if recipe.directional else None)
     inputs = jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1)
-    raw = jnp.moveaxis(network.forward(layers, inputs), -1, 0)
-    return target.numbers(target.decode(list(raw), recipe.instances))
+    raw = network.forward(layers, inputs)
+    points = _points(batch, recipe)
+    value = target.eval(target.decode(list(raw.T), recipe.instances), points.wi, points.wo)
+    return jnp.stack([(c * points.weight).mean(axis=0) for c in value])
 
 
 def _points(batch: Batch, recipe: Recipe) -> ava.Points:

@@ -17,7 +17,9 @@ def plot_losses(log_losses: Sequence[float], path: Path, title: str) -> Path:
     steps = np.arange(window, len(losses) + 1)
     smooth = np.convolve(losses, np.ones(window) / window, mode="valid")
     figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.add_subplot(title=title, xlabel="step", ylabel="log loss against noisy bins (eq. 7)", xscale="log", yscale="log")
+    axes = figure.add_subplot(
+        title=title, xlabel="step", ylabel="log loss against noisy bins (eq. 7)", xscale="log", yscale="log"
+    )
     axes.plot(steps, smooth)
     axes.grid(alpha=0.3, which="both")
     figure.savefig(path, dpi=110)

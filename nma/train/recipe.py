@@ -12,17 +12,15 @@ from nma.errors import NmaError
 class Recipe:
     """Settings of a training run.
 
-    A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, and
-    averages the target over `points` points per bin.
+    A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, with one network pass per
+    row, and averages the target over `points` points per bin.
 
-    - `nodes`: passes of the network per row; 1 (the paper) keeps the target's parameters constant in the row, 2
-      interpolates them between its ends.
     - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
       one point in the middle of the bin (point supervision).
     - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
     - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so
       that noisy bins pull towards their mean rather than their median.
-    - `energy`: adds this much of the linear error to the logarithmic one, so that bright bins count for their energy too.
+    - `energy`: adds this much of the linear error to the logarithmic one, so that bright bins count for their energy.
     - `schedule`: "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls, "constant" keeps it.
     - `average`: decay of the exponential moving average of the weights; 0 means none.
     """
@@ -33,16 +31,15 @@ class Recipe:
     encoding: str = "layered3"
     rows: int = 512
     bins_per_row: int = 8
-    nodes: int = 2
     points: int = 8
     points_law: Literal["crowded", "uniform", "centre"] = "crowded"
     bins_law: Literal["mirror", "uniform"] = "mirror"
     loss: Literal["huber", "log"] = "huber"
-    energy: float = 0.02
+    energy: float = 0.05
     schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
     learning_rate: float = 3e-3
     average: float = 0.999
-    steps: int = 100_000
+    steps: int = 150_000
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -65,7 +62,6 @@ PAPER = Recipe(
     encoding="raw",
     rows=1000,
     bins_per_row=1,
-    nodes=1,
     points=20,
     points_law="uniform",
     bins_law="uniform",

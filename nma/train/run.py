@@ -23,7 +23,7 @@ from nma.params import ParamSpace
 from nma.table import Tables
 from nma.target import Blend, Principled
 from nma.train import loop
-from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.data import BinSampler, Pool, draw
 from nma.train.recipe import Recipe
 
 # Where training starts: a coloured rough metal under a sharp, colourless reflection.
@@ -59,8 +59,8 @@ def train_class(
 ) -> tuple[Adapter, loop.Run]:
     """Trains on tables of many materials; `record` says where they come from and is stored with the weights.
 
-    With `streaming`, the tables are only the first content of the pool: fresh materials replace them as fast as they can
-    be simulated between steps, which makes losses depend on the machine's speed.
+    With `streaming`, the tables are only the first content of the pool: after every group of steps a block of fresh
+    materials replaces the oldest.
     """
     pool = Pool.of(tables)
     sampler = BinSampler(recipe.bins_law)
@@ -93,7 +93,9 @@ def fit_material(
     return train_class(space, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
 
 
-def _refreshing(pool: Pool, settings: Settings, progress: Callable[[loop.Run], None]) -> Callable[[loop.Run], None]:
+def _refreshing(
+    pool: Pool, settings: Settings, progress: Callable[[loop.Run], None]
+) -> Callable[[loop.Run], None]:
     """A progress callback that also exchanges a block of the pool, each time it is called."""
     fresh = stream(settings, first=len(pool.params))
     replaced = 0
@@ -125,5 +127,11 @@ def _adapter(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str,
         "date": time.strftime("%Y-%m-%d"),
     }
     return Adapter(
-        space, recipe.encoding, loop.result(run, recipe), recipe.instances, recipe.directional, target.PRINCIPLED_PARAMS, training
+        space,
+        recipe.encoding,
+        loop.result(run, recipe),
+        recipe.instances,
+        recipe.directional,
+        target.PRINCIPLED_PARAMS,
+        training,
     )
