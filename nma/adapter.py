@@ -23,7 +23,13 @@ from nma.target.principled import DIALECT
 
 def shipped() -> tuple[str, ...]:
     """Names of the adapters that come with the package."""
-    return tuple(sorted(p.name.removesuffix(".safetensors") for p in files("nma.adapters").iterdir() if p.name.endswith(".safetensors")))
+    return tuple(
+        sorted(
+            p.name.removesuffix(".safetensors")
+            for p in files("nma.adapters").iterdir()
+            if p.name.endswith(".safetensors")
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,9 @@ class Adapter:
         if str(name_or_path) in shipped():
             path = Path(str(files("nma.adapters").joinpath(f"{name_or_path}.safetensors")))
         elif path.suffix != ".safetensors" and not path.exists():
-            raise WeightsError(f"'{name_or_path}' is neither a file nor a shipped adapter ({', '.join(shipped())})")
+            raise WeightsError(
+                f"'{name_or_path}' is neither a file nor a shipped adapter ({', '.join(shipped())})"
+            )
         header, layers = weights.read(path)
         adapter = Adapter(
             SPACES[header.class_name],
@@ -115,4 +123,6 @@ class Adapter:
                 f"its description says {inputs} to {self.size}; train again"
             )
         if dialect != DIALECT:
-            raise WeightsError(f"{path}: written for the Principled dialect '{dialect}', this version evaluates '{DIALECT}'")
+            raise WeightsError(
+                f"{path}: written for the Principled dialect '{dialect}', this version evaluates '{DIALECT}'"
+            )

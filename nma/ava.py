@@ -58,9 +58,7 @@ def bin_points(i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid
     return Points(*_directions(mu_i, mu_o, psi), weight)
 
 
-def bin_points_at(
-    mu_i: Float, o: Float, p: Float, u: tuple[Float, Float], grid: Grid = ISOTROPIC
-) -> Points:
+def bin_points_at(mu_i: Float, o: Float, p: Float, u: tuple[Float, Float], grid: Grid = ISOTROPIC) -> Points:
     """Points of wo in the bin (o, p) for the given cos(theta_i): the average is over wo alone."""
     width = 1.0 / grid.theta_o
     sin_i = ops.safe_sqrt(1.0 - mu_i * mu_i)
@@ -96,7 +94,9 @@ def _crowd(u: Float, low: Float, high: Float, scale: Float) -> tuple[Float, Floa
     return x, 1.0 / ((magnitude + scale) * total)
 
 
-def uniform_bin_points(i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid: Grid = ISOTROPIC) -> Points:
+def uniform_bin_points(
+    i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid: Grid = ISOTROPIC
+) -> Points:
     """The point `u` of the unit cube spread uniformly over the bin (i, o, p): the paper's choice."""
     mu_i = ops.clip((i + u[0]) * (1.0 / grid.theta_i), 1e-6, 1.0)
     mu_o = ops.clip((o + u[1]) * (1.0 / grid.theta_o), 1e-6, 1.0)

@@ -37,7 +37,12 @@ def layered3(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]
     the refracted direction."""
     alpha_top, alpha_bottom, eta_top, *rest = columns
     eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
-    ranged = (("alpha_top", alpha_top), ("alpha_bottom", alpha_bottom), ("eta_top", eta_top), ("sigma_t", sigma_t))
+    ranged = (
+        ("alpha_top", alpha_top),
+        ("alpha_bottom", alpha_bottom),
+        ("eta_top", eta_top),
+        ("sigma_t", sigma_t),
+    )
     unit = [LAYERED3[name].normalise(x) for name, x in ranged]
     for cosine in (1.0, _GRAZING):
         unit += [fresnel_conductor(cosine, e / eta_top, x / eta_top) for e, x in zip(eta, k, strict=True)]
@@ -54,7 +59,9 @@ ENCODERS: dict[str, Encoder] = {"raw": raw, "direction": direction, "layered3": 
 def get(name: str) -> Encoder:
     """The encoder called `name`; `WeightsError` for one this version does not know."""
     if name not in ENCODERS:
-        raise WeightsError(f"unknown input encoding '{name}'; this version knows {', '.join(ENCODERS)}: upgrade the package")
+        raise WeightsError(
+            f"unknown input encoding '{name}'; this version knows {', '.join(ENCODERS)}: upgrade the package"
+        )
     return ENCODERS[name]
 
 

@@ -74,13 +74,17 @@ def read(path: str | Path) -> tuple[Header, Layers]:
             metadata = f.metadata() or {}
             tensors = {name: f.get_tensor(name) for name in f.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError) as e:
-        raise WeightsError(f"{path}: truncated, or not a safetensors file ({e}); copy or train it again") from None
+        raise WeightsError(
+            f"{path}: truncated, or not a safetensors file ({e}); copy or train it again"
+        ) from None
     if "nma" not in metadata:
         raise WeightsError(f"{path}: a safetensors file without NMA metadata; `nma train` writes adapters")
     try:
         header = Header(**json.loads(metadata["nma"]))
     except (TypeError, json.JSONDecodeError) as e:
-        raise WeightsError(f"{path}: metadata of another version ({e}); upgrade the package or train again") from None
+        raise WeightsError(
+            f"{path}: metadata of another version ({e}); upgrade the package or train again"
+        ) from None
     _check_class(path, header)
     return header, _layers(path, header, tensors)
 
@@ -88,13 +92,19 @@ def read(path: str | Path) -> tuple[Header, Layers]:
 def _check_class(path: Path, header: Header) -> None:
     """Refuses formats and classes that this version does not know, or knows differently."""
     if header.format != FORMAT:
-        raise WeightsError(f"{path}: format {header.format}, this version reads {FORMAT}; upgrade the package")
+        raise WeightsError(
+            f"{path}: format {header.format}, this version reads {FORMAT}; upgrade the package"
+        )
     space = SPACES.get(header.class_name)
     if space is None:
-        raise WeightsError(f"{path}: made for class '{header.class_name}'; this version knows {', '.join(SPACES)}")
+        raise WeightsError(
+            f"{path}: made for class '{header.class_name}'; this version knows {', '.join(SPACES)}"
+        )
     names = [(p["name"], p["size"]) for p in header.parameters]
     if names != [(p.name, p.size) for p in space.params]:
-        raise WeightsError(f"{path}: its class '{header.class_name}' has the parameters {names}, unlike this version's")
+        raise WeightsError(
+            f"{path}: its class '{header.class_name}' has the parameters {names}, unlike this version's"
+        )
 
 
 def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layers:
@@ -107,7 +117,9 @@ def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layer
             raise WeightsError(f"{path}: tensor {e} is missing; copy or train it again") from None
         fan_in = layers[-1][0].shape[0] if layers else matrix.shape[-1]
         if matrix.ndim != 2 or matrix.shape[1] != fan_in or bias.shape != matrix.shape[:1]:
-            raise WeightsError(f"{path}: layer {number} has shapes {matrix.shape} and {bias.shape}, which do not fit")
+            raise WeightsError(
+                f"{path}: layer {number} has shapes {matrix.shape} and {bias.shape}, which do not fit"
+            )
         if not (np.isfinite(matrix).all() and np.isfinite(bias).all()):
             raise WeightsError(f"{path}: layer {number} holds numbers that are not finite; train again")
         layers.append((matrix, bias))

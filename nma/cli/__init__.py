@@ -14,7 +14,8 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs by a tiny network.\n\n"
+    help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs "
+    "by a tiny network.\n\n"
     "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
     "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], judge with [bold]evaluate[/bold] and "
     "[bold]compare[/bold], look with [bold]render[/bold].",
@@ -31,5 +32,7 @@ def main() -> None:
         print(f"nma: {e}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
-        print("nma: interrupted; run the same command again to go on where it can be resumed", file=sys.stderr)
+        print(
+            "nma: interrupted; run the same command again to go on where it can be resumed", file=sys.stderr
+        )
         sys.exit(130)

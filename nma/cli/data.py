@@ -20,7 +20,9 @@ def register(app: typer.Typer) -> None:
     app.command()(dataset)
 
 
-def materials(name: Annotated[str | None, typer.Argument(help="Show this material's parameters.")] = None) -> None:
+def materials(
+    name: Annotated[str | None, typer.Argument(help="Show this material's parameters.")] = None,
+) -> None:
     """List the named materials, or show one of them."""
     from nma import materials as library
 
@@ -29,17 +31,35 @@ def materials(name: Annotated[str | None, typer.Argument(help="Show this materia
         console.out.print(console.table(("name", "title", "description"), rows))
         return
     material = library.load(name)
-    rows = [(p.name, p.symbol, f"{p.low:g} .. {p.high:g}", _show(material.values[p.name])) for p in material.space.params]
-    console.out.print(console.table(("parameter", "symbol", "range", "value"), rows, f"{material.title}: {material.description}"))
+    rows = [
+        (p.name, p.symbol, f"{p.low:g} .. {p.high:g}", _show(material.values[p.name]))
+        for p in material.space.params
+    ]
+    console.out.print(
+        console.table(
+            ("parameter", "symbol", "range", "value"), rows, f"{material.title}: {material.description}"
+        )
+    )
 
 
 def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="The reference file (.npz) to write.")],
-    params: Annotated[Path | None, typer.Option(help="A file (.npz) with `params` (n, 13), a reference file for example.")] = None,
-    material: Annotated[list[str] | None, typer.Option(help="A named material or material file; may be repeated.")] = None,
+    params: Annotated[
+        Path | None, typer.Option(help="A file (.npz) with `params` (n, 13), a reference file for example.")
+    ] = None,
+    material: Annotated[
+        list[str] | None, typer.Option(help="A named material or material file; may be repeated.")
+    ] = None,
     draw: Annotated[int, typer.Option(help="Draw this many materials at random instead.")] = 0,
-    population: Annotated[str, typer.Option(help="Where drawn conductors come from: mixed, range, metals, held_out_metals, unseen_metals.")] = "mixed",
-    class_name: Annotated[str, typer.Option("--class", help="The class of the source materials.")] = "layered3",
+    population: Annotated[
+        str,
+        typer.Option(
+            help="Where drawn conductors come from: mixed, range, metals, held_out_metals, unseen_metals."
+        ),
+    ] = "mixed",
+    class_name: Annotated[
+        str, typer.Option("--class", help="The class of the source materials.")
+    ] = "layered3",
     walks: Annotated[int, typer.Option(help="Random walks per material.")] = 16_000_000,
     seed: Annotated[int, typer.Option(help="Seed of the walks and of the drawn materials.")] = 0,
 ) -> None:
@@ -65,7 +85,9 @@ def simulate(
                 simulated += 1
             rate = simulated * walks / (time.perf_counter() - began) / 1e6
             bar.update(task, completed=n + 1, rate=f"{rate:.1f}")
-    Tables.concatenate([Tables.load(parts / f"{key:016x}-{walks}.npz") for key in stream_keys(seed, range(len(vectors)))]).save(output)
+    Tables.concatenate(
+        [Tables.load(parts / f"{key:016x}-{walks}.npz") for key in stream_keys(seed, range(len(vectors)))]
+    ).save(output)
     shutil.rmtree(parts)
     console.err.print(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
 
@@ -76,7 +98,9 @@ def dataset(
     materials: Annotated[int, typer.Option(help="Number of materials.")] = 8000,
     walks: Annotated[int, typer.Option(help="Random walks per material.")] = 819_200,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal datasets.")] = 0,
-    population: Annotated[str, typer.Option(help="mixed, range, metals, held_out_metals or unseen_metals.")] = "mixed",
+    population: Annotated[
+        str, typer.Option(help="mixed, range, metals, held_out_metals or unseen_metals.")
+    ] = "mixed",
 ) -> None:
     """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
     from nma.dataset import Dataset, Settings
@@ -104,7 +128,9 @@ def _vectors(space, params, material, draw, population, seed):
             with np.load(params) as f:
                 return space.check(f["params"])
         except (OSError, KeyError, ValueError) as e:
-            raise TableError(f"{params}: no .npz file with an array `params` (n, {space.size}): {e}") from None
+            raise TableError(
+                f"{params}: no .npz file with an array `params` (n, {space.size}): {e}"
+            ) from None
     if material:
         from nma import materials as library
 

@@ -18,7 +18,9 @@ _Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, 
 _Seed = Annotated[int | None, typer.Option(help="Seed of the weights and of the batches.")]
 _Rate = Annotated[float | None, typer.Option(help="Learning rate (its peak under the onecycle schedule).")]
 _Points = Annotated[int | None, typer.Option(help="Points per bin of the AvA estimate (eq. 6).")]
-_PointsLaw = Annotated[str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")]
+_PointsLaw = Annotated[
+    str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")
+]
 _Loss = Annotated[str | None, typer.Option(help="huber, or log (the paper's eq. 7).")]
 
 
@@ -32,11 +34,21 @@ def train(
     class_name: Annotated[str, typer.Argument(help="The class to learn, layered3.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
     data: Annotated[Path | None, typer.Option(help="A dataset made by `nma dataset`.")] = None,
-    stream: Annotated[int, typer.Option(help="Without a dataset: keep this many fresh materials in memory, replaced as training goes on.")] = 0,
+    stream: Annotated[
+        int,
+        typer.Option(
+            help="Without a dataset: keep this many fresh materials in memory, replaced as training goes on."
+        ),
+    ] = 0,
     walks: Annotated[int, typer.Option(help="Walks per streamed material.")] = 819_200,
+    refresh: Annotated[int, typer.Option(help="Steps between two exchanges of streamed materials.")] = 400,
     preset: Annotated[str, typer.Option(help="class, or paper for the paper's recipe.")] = "class",
-    variant: Annotated[str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")] = "blended+omega_i",
-    instances: Annotated[int | None, typer.Option(help="Principled instances in the blend (1 to 5), instead of the variant's.")] = None,
+    variant: Annotated[
+        str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
+    ] = "blended+omega_i",
+    instances: Annotated[
+        int | None, typer.Option(help="Principled instances in the blend (1 to 5), instead of the variant's.")
+    ] = None,
     network: _Network = None,
     steps: _Steps = None,
     points: _Points = None,
@@ -67,11 +79,11 @@ def train(
         directional=directional,
     )
     space = sources.get(class_name).space
-    tables, record, streaming = _training_data(class_name, data, stream, walks, recipe.seed)
+    source, record = _training_data(class_name, data, stream, walks, recipe.seed)
     checkpoint = output.with_name(output.name + ".ckpt")
     with _TrainingBar(recipe) as bar:
         adapter, run = training.train_class(
-            space, recipe, tables, record, checkpoint=checkpoint, streaming=streaming, progress=bar.update
+            space, recipe, source, record, checkpoint=checkpoint, refresh=refresh, progress=bar.update
         )
     _finish(adapter, run, output)
     checkpoint.unlink(missing_ok=True)
@@ -81,7 +93,9 @@ def fit(
     material: Annotated[str, typer.Argument(help="A named material or a material file.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
     walks: Annotated[int, typer.Option(help="Walks of the table to fit.")] = 64_000_000,
-    variant: Annotated[str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")] = "blended+omega_i",
+    variant: Annotated[
+        str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
+    ] = "blended+omega_i",
     network: _Network = None,
     steps: _Steps = None,
     points: _Points = None,
@@ -120,14 +134,18 @@ def fit(
     console.err.print(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
     record = {"data": f"material {material}", "material": source_material.name, "walks_per_material": walks}
     with _TrainingBar(recipe) as bar:
-        adapter, run = training.fit_material(source.space, recipe, vector, tables, record, progress=bar.update)
+        adapter, run = training.fit_material(
+            source.space, recipe, vector, tables, record, progress=bar.update
+        )
     _finish(adapter, run, output)
 
 
 def evaluate(
     weights: Annotated[str, typer.Argument(help="A weights file or the name of a shipped adapter.")],
     reference: Annotated[Path, typer.Option(help="A reference file made by `nma simulate`.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
+    ] = False,
 ) -> None:
     """Compare an adapter with reference tables over the paper's bins: means over bins and RGB, then over materials.
 
@@ -154,38 +172,44 @@ def evaluate(
         return
     rows = [(str(n), *(m[f] for f in FIGURES)) for n, m in enumerate(result.materials)]
     rows.append(("mean", *(result.mean[f] for f in FIGURES)))
-    console.out.print(console.table(("material", *FIGURES), rows, f"{weights} ({adapter.variant}) against {reference}"))
+    console.out.print(
+        console.table(("material", *FIGURES), rows, f"{weights} ({adapter.variant}) against {reference}")
+    )
     console.out.print(f"The adapter's bin averages are exact to {result.integration_error:.1e} in log loss.")
     if result.estimated_error:
-        console.out.print("The reference has no standard errors; its noise floor is an upper bound from counting walks.")
+        console.out.print(
+            "The reference has no standard errors; its noise floor is an upper bound from counting walks."
+        )
 
 
 def _variant(name: str) -> tuple[int, bool]:
     """(instances, whether parameters vary with wi) of the paper's four variants."""
-    variants = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
+    variants = {
+        "blended+omega_i": (2, True),
+        "blended": (2, False),
+        "omega_i": (1, True),
+        "single": (1, False),
+    }
     if name not in variants:
         raise typer.BadParameter(f"variant must be one of {', '.join(variants)}, got '{name}'")
     return variants[name]
 
 
 def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
-    """(first tables, record of their origin, settings of the stream or None)."""
-    from nma.dataset import Dataset, Settings, simulate_block
+    """(tables of a dataset, or the settings of a stream; record of their origin)."""
+    from nma.dataset import Dataset, Settings
 
     if (data is None) == (stream == 0):
         raise typer.BadParameter("give either --data DATASET or --stream MATERIALS")
-    if data is not None:
-        dataset = Dataset.open(data)
-        if dataset.settings.class_name != class_name:
-            raise typer.BadParameter(f"{data} holds class {dataset.settings.class_name}, not {class_name}")
-        with console.err.status(f"reading {dataset.settings.materials} tables"):
-            tables = dataset.load()
-        return tables, {"data": "dataset", "dataset": asdict(dataset.settings)}, None
-    settings = Settings(class_name, stream, walks, seed)
-    with console.err.status(f"simulating the first {stream} materials"):
-        tables = simulate_block(settings, range(stream))
-    tables.values = tables.values.astype(np.float16)
-    return tables, {"data": "stream", "dataset": asdict(settings)}, settings
+    if data is None:
+        settings = Settings(class_name, stream, walks, seed)
+        return settings, {"data": "stream", "dataset": asdict(settings)}
+    dataset = Dataset.open(data)
+    if dataset.settings.class_name != class_name:
+        raise typer.BadParameter(f"{data} holds class {dataset.settings.class_name}, not {class_name}")
+    with console.err.status(f"reading {dataset.settings.materials} tables"):
+        tables = dataset.load()
+    return tables, {"data": "dataset", "dataset": asdict(dataset.settings)}
 
 
 def _finish(adapter, run, output: Path) -> None:
@@ -219,6 +243,8 @@ class _TrainingBar:
         if self._first is None:
             self._first, self._began = run.step, time.perf_counter()
             return
-        rate = (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
+        rate = (
+            (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
+        )
         loss = np.mean(run.log_losses[-500:])
         self._bar.update(self._task, completed=run.step, rate=f"{rate:.2f}", note=f"log loss {loss:.5f}")

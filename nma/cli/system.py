@@ -25,7 +25,10 @@ def info(
     from nma.target.principled import DIALECT
 
     if weights is None:
-        rows = [(name, Adapter.load(name).variant, network.parameters(Adapter.load(name).layers)) for name in shipped()]
+        rows = [
+            (name, Adapter.load(name).variant, network.parameters(Adapter.load(name).layers))
+            for name in shipped()
+        ]
         console.out.print(console.table(("adapter", "variant", "parameters"), rows))
         return
     adapter = Adapter.load(weights)
@@ -56,7 +59,10 @@ def doctor() -> None:
     from nma.doctor import check
 
     findings = check()
-    rows = [(f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found, "" if f.ok else f.fix) for f in findings]
+    rows = [
+        (f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found, "" if f.ok else f.fix)
+        for f in findings
+    ]
     console.out.print(console.table(("what", "state", "found", "to mend it"), rows))
     if not all(f.ok or f.optional for f in findings):
         raise typer.Exit(1)

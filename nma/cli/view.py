@@ -57,7 +57,7 @@ def render(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="OUT.png or OUT.exr; both are written.  [default: out/SUBJECT.png]"
+            "--output", "-o", help="OUT.png or OUT.exr; both are written.", show_default="out/SUBJECT.png"
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="nma, the adapter, or layered, the reference.")] = "nma",
@@ -67,10 +67,11 @@ def render(
     camera: _Camera = "hero",
     envmap: _Envmap = None,
     size: Annotated[
-        str | None, typer.Option(help="Pixels: 512 for a square, or 512x384.  [default: 512, or the scene's]")
+        str | None,
+        typer.Option(help="Pixels: 512 for a square, or 512x384.", show_default="512, or the scene's"),
     ] = None,
     spp: Annotated[
-        int | None, typer.Option(help="Samples per pixel.  [default: 128, or the scene's]")
+        int | None, typer.Option(help="Samples per pixel.", show_default="128, or the scene's")
     ] = None,
     depth: _Depth = 6,
     seed: _Seed = 0,

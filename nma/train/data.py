@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from queue import Queue
+from queue import Empty, Queue
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nma.dataset import Settings, simulate_block
 from nma.table import ISOTROPIC, Grid, Tables
 from nma.train.recipe import Recipe
+
+# Materials that a stream exchanges at a time: enough to keep the simulation's lanes busy.
+STREAM_BLOCK = 16
 
 
 class Batch(NamedTuple):
@@ -31,7 +36,7 @@ class Batch(NamedTuple):
 
 @dataclass
 class Pool:
-    """Tables that batches are drawn from; `replace` exchanges some of them while training streams."""
+    """Tables that batches are drawn from."""
 
     params: NDArray[np.float32]
     values: NDArray[np.floating]
@@ -42,10 +47,34 @@ class Pool:
     def of(tables: Tables) -> Pool:
         return Pool(tables.params.astype(np.float32), tables.values, tables.walks)
 
-    def replace(self, first: int, tables: Tables) -> None:
-        """Overwrites the materials from `first` on, wrapping around."""
-        at = (first + np.arange(len(tables.params))) % len(self.params)
-        self.params[at], self.values[at], self.walks[at] = tables.params, tables.values, tables.walks
+
+class Stream:
+    """A pool of fresh materials: every `refresh` steps a block of new ones replaces the oldest.
+
+    The pool of a step depends on the settings and the step alone, so that a resumed run sees what it would have seen.
+    `settings.materials` is the size of the pool. Steps must be asked for in ascending order.
+    """
+
+    def __init__(self, settings: Settings, refresh: int, first_step: int = 0):
+        self._settings, self._refresh = settings, refresh
+        self._block = min(STREAM_BLOCK, settings.materials)
+        self._replaced = first_step // refresh
+        oldest = self._replaced * self._block
+        indices = np.arange(oldest, oldest + settings.materials)
+        # Material k lives in slot k modulo the size.
+        tables = simulate_block(settings, indices[np.argsort(indices % settings.materials)])
+        self._pool = Pool(tables.params.astype(np.float32), tables.values.astype(np.float16), tables.walks)
+
+    def __call__(self, step: int) -> Pool:
+        """The pool at `step`."""
+        while self._replaced < step // self._refresh:
+            size, first = self._settings.materials, self._settings.materials + self._replaced * self._block
+            indices = np.arange(first, first + self._block)
+            tables = simulate_block(self._settings, indices)
+            at = indices % size
+            self._pool.params[at], self._pool.values[at] = tables.params, tables.values
+            self._replaced += 1
+        return self._pool
 
 
 class BinSampler:
@@ -102,18 +131,29 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
 def batches(source: Callable[[int], Batch], start: int, stop: int, group: int) -> Iterator[tuple[int, Batch]]:
     """(first step, `group` steps stacked) from `start` to `stop`, prepared by a thread ahead of their use."""
     queue: Queue = Queue(maxsize=2)
+    stopped = threading.Event()
 
     def produce() -> None:
         try:
             for first in range(start, stop, group):
                 steps = [source(s) for s in range(first, min(first + group, stop))]
                 queue.put((first, Batch(*(np.stack(parts) for parts in zip(*steps, strict=True)))))
+                if stopped.is_set():
+                    return
             queue.put(None)
         except BaseException as e:  # handed to the consumer, which raises it
             queue.put(e)
 
-    threading.Thread(target=produce, daemon=True).start()
-    while (item := queue.get()) is not None:
-        if isinstance(item, BaseException):
-            raise item
-        yield item
+    thread = threading.Thread(target=produce, daemon=True)
+    thread.start()
+    try:
+        while (item := queue.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        # A consumer that leaves early must not leave the thread waiting for room in the queue.
+        stopped.set()
+        while thread.is_alive():
+            with suppress(Empty):
+                queue.get(timeout=0.01)

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 import nma
 from nma import encoding, network, target
 from nma.adapter import Adapter
-from nma.dataset import Settings, stream
+from nma.dataset import Settings
 from nma.network import Layers
 from nma.ops import Color
 from nma.params import ParamSpace
 from nma.table import Tables
 from nma.target import Blend, Principled
 from nma.train import loop
-from nma.train.data import BinSampler, Pool, draw
+from nma.train.data import BinSampler, Pool, Stream, draw
 from nma.train.recipe import Recipe
 
 # Where training starts: a coloured rough metal under a sharp, colourless reflection.
@@ -49,33 +49,36 @@ def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
 def train_class(
     space: ParamSpace,
     recipe: Recipe,
-    tables: Tables,
+    data: Tables | Settings,
     record: dict[str, Any],
     *,
     checkpoint: Path | None = None,
-    streaming: Settings | None = None,
+    refresh: int = 400,
     progress: Callable[[loop.Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Adapter, loop.Run]:
     """Trains on tables of many materials; `record` says where they come from and is stored with the weights.
 
-    With `streaming`, the tables are only the first content of the pool: after every group of steps a block of fresh
-    materials replaces the oldest.
+    Given settings instead of tables, training streams: it keeps `data.materials` in memory and exchanges a block of
+    them for fresh ones every `refresh` steps.
     """
-    pool = Pool.of(tables)
     sampler = BinSampler(recipe.bins_law)
     layers = initial_layers(recipe, space)
     run = loop.resume(recipe, layers, checkpoint) if checkpoint else loop.start(recipe, layers)
-    report = _refreshing(pool, streaming, progress) if streaming else progress
+    pool = Stream(data, refresh, run.step) if isinstance(data, Settings) else _constant(Pool.of(data))
     loop.train(
         recipe,
         run,
-        lambda step: draw(pool, sampler, recipe, step),
+        lambda step: draw(pool(step), sampler, recipe, step),
         checkpoint=checkpoint,
-        progress=report,
+        progress=progress,
         budget_seconds=budget_seconds,
     )
     return _adapter(space, recipe, run, record), run
+
+
+def _constant(pool: Pool) -> Callable[[int], Pool]:
+    return lambda step: pool
 
 
 def fit_material(
@@ -91,23 +94,6 @@ def fit_material(
     """Overfits the table of one material (paper Fig. 4, left)."""
     record = {**record, "params": np.asarray(params).ravel().tolist()}
     return train_class(space, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
-
-
-def _refreshing(
-    pool: Pool, settings: Settings, progress: Callable[[loop.Run], None]
-) -> Callable[[loop.Run], None]:
-    """A progress callback that also exchanges a block of the pool, each time it is called."""
-    fresh = stream(settings, first=len(pool.params))
-    replaced = 0
-
-    def report(run: loop.Run) -> None:
-        nonlocal replaced
-        tables = next(fresh)
-        pool.replace(replaced, tables)
-        replaced += len(tables.params)
-        progress(run)
-
-    return report
 
 
 def _adapter(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str, Any]) -> Adapter:
