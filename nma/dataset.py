@@ -1,8 +1,8 @@
 """A class sampled into many tables on disk: one zarr chunk per material, resumable, written by any number of workers.
 
-A chunk is written to a temporary file and renamed, so it exists only when it is whole; the material and its random
-stream depend on (seed, index) alone. Hence a killed run goes on where it stopped, and workers need no coordination:
-should two of them simulate one material, they write the same bytes.
+A chunk is written to a temporary file and renamed (by zarr 3.1.3 or later), so it exists only when it is whole; the
+material and its random stream depend on (seed, index) alone. Hence a killed run goes on where it stopped, and workers
+need no coordination: should two of them simulate one material, they write the same bytes.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ import hashlib
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+from zarr.errors import ContainsArrayError
 
 from nma import sources
 from nma.errors import DatasetError
@@ -25,13 +28,17 @@ from nma.params import Population
 from nma.table import ISOTROPIC, Tables, stream_keys, tabulate
 
 FORMAT = 1
-# Materials simulated by one kernel launch; has no influence on the result.
+# Materials simulated at once, and walks that are lost at most when a run is killed; no influence on the result.
 _BLOCK = 16
+_BLOCK_WALKS = 1 << 27
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What determines every number of a dataset."""
+    """What determines every number of a dataset: `walks` per material, the rest as `nma dataset --help` has it.
+
+    Raises `DatasetError` for settings that make no dataset.
+    """
 
     class_name: str
     materials: int
@@ -39,6 +46,17 @@ class Settings:
     seed: int
     population: Population = "mixed"
     format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        if self.materials < 1 or self.walks < 1 or self.seed < 0:
+            raise DatasetError(
+                "a dataset has at least one material and one walk, and no negative seed; "
+                f"got {self.materials} materials, {self.walks} walks, seed {self.seed}"
+            )
+        if self.population not in get_args(Population) or self.population == "unseen_metals":
+            known = ", ".join(p for p in get_args(Population) if p != "unseen_metals")
+            # Each material is drawn on its own, so nothing can depend on its place among the others.
+            raise DatasetError(f"a dataset's population is one of {known}; got '{self.population}'")
 
 
 def draw_params(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.float64]:
@@ -58,7 +76,11 @@ def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[i
     """Parameters and tables, without errors, of the materials `indices`."""
     source = sources.get(settings.class_name)
     return tabulate(
-        source, draw_params(settings, indices), settings.walks, stream_keys(settings.seed, indices), error=False
+        source,
+        draw_params(settings, indices),
+        settings.walks,
+        stream_keys(settings.seed, indices),
+        error=False,
     )
 
 
@@ -72,67 +94,84 @@ class Dataset:
     def create(path: str | Path, settings: Settings) -> Dataset:
         """Opens the dataset at `path` if it was made with the same settings, or creates it. Raises `DatasetError`."""
         path = Path(path)
-        if (path / "zarr.json").exists():
-            found = Dataset.open(path)
-            if found.settings != settings:
-                raise DatasetError(
-                    f"{path} was made with {found.settings}, asked for are {settings}; choose another folder or the same settings"
-                )
-            return found
-        path.parent.mkdir(parents=True, exist_ok=True)
-        table = zarr.create_array(
-            store=path,
-            shape=(settings.materials, *ISOTROPIC.shape),
-            chunks=(1, *ISOTROPIC.shape),
-            dtype="float16",
-            serializer=BytesCodec(),
-            compressors=[ZstdCodec(level=1), Crc32cCodec()],
-            attributes={"nma_dataset": asdict(settings), "nma_params": _fingerprint(settings)},
-        )
-        return Dataset(path, settings, table)
+        if not (path / "zarr.json").exists():
+            _create_array(path, settings)
+        found = Dataset.open(path)
+        if found.settings != settings:
+            asked = asdict(settings)
+            changed = [
+                f"{k} {v} (asked for: {asked[k]})" for k, v in asdict(found.settings).items() if v != asked[k]
+            ]
+            raise DatasetError(
+                f"{path} was made with {', '.join(changed)}; choose another folder or the same settings"
+            )
+        return found
 
     @staticmethod
     def open(path: str | Path) -> Dataset:
         """The dataset at `path`; `DatasetError` if there is none."""
         path = Path(path)
         try:
-            table = zarr.open_array(path, mode="r+")
-            settings = Settings(**table.attrs["nma_dataset"])
+            # A chunk of zeros is stored like any other: its file says that the material is done.
+            table = zarr.open_array(path, mode="r+", config={"write_empty_chunks": True})
+            settings = Settings(**dict(table.attrs["nma_dataset"]))  # type: ignore[arg-type]
             fingerprint = table.attrs["nma_params"]
         except Exception as e:
-            raise DatasetError(f"{path} is not a dataset of tables ({e}); `nma dataset CLASS {path}` makes one") from None
+            raise DatasetError(
+                f"{path} is not a dataset of tables ({e}); `nma dataset CLASS {path}` makes one"
+            ) from None
         if settings.format != FORMAT:
-            raise DatasetError(f"{path} has format {settings.format}, this version reads {FORMAT}; generate it again")
+            raise DatasetError(
+                f"{path} has format {settings.format}, this version reads {FORMAT}; generate it again"
+            )
         if fingerprint != _fingerprint(settings):
-            raise DatasetError(f"{path} was made by a version that drew other parameters from its seed; generate it again")
+            raise DatasetError(
+                f"{path} was made by a version that drew other parameters from its seed; generate it again"
+            )
         return Dataset(path, settings, table)
 
-    def _chunk(self, index: int) -> Path:
-        return self.path / "c" / "/".join([str(index)] + ["0"] * len(ISOTROPIC.shape))
+    def _chunk(self, index: int) -> str:
+        return os.path.join(self.path, "c", str(index), *["0"] * len(ISOTROPIC.shape))
+
+    def _has(self, index: int) -> bool:
+        return os.path.exists(self._chunk(index))
 
     def missing(self) -> NDArray[np.int64]:
         """Indices of the materials that are not on disk yet."""
-        return np.array([i for i in range(self.settings.materials) if not self._chunk(i).exists()], np.int64)
+        return np.array([i for i in range(self.settings.materials) if not self._has(i)], np.int64)
 
     def write(self, progress: Callable[[int], None] = lambda done: None) -> None:
-        """Simulates and stores what is missing, calling `progress` with the number of materials done."""
-        blocks = np.array_split(np.arange(self.settings.materials), -(-self.settings.materials // _BLOCK))
+        """Simulates and stores what is missing, calling `progress` with the number of materials done, by anybody."""
+        size = max(1, min(_BLOCK, _BLOCK_WALKS // self.settings.walks))
+        blocks = np.array_split(np.arange(self.settings.materials), -(-self.settings.materials // size))
+        left = self.missing()
         # Each worker takes the blocks in an order of its own, so that several of them seldom meet.
-        order = np.random.default_rng(os.getpid()).permutation(len(blocks))
-        for b in order:
-            todo = np.array([i for i in blocks[b] if not self._chunk(i).exists()], np.int64)
-            if len(todo):
-                values = simulate_block(self.settings, todo).values.astype(np.float16)
-                for i, value in zip(todo, values, strict=True):
-                    self._table[int(i)] = value
-            progress(self.settings.materials - len(self.missing()))
+        for b in np.random.default_rng(os.getpid()).permutation(len(blocks)):
+            todo = [int(i) for i in blocks[b] if not self._has(i)]
+            if todo:
+                self._store(todo, simulate_block(self.settings, todo).values.astype(np.float16))
+            left = np.array([i for i in left if not self._has(i)], np.int64)
+            progress(self.settings.materials - len(left))
+
+    def _store(self, indices: Sequence[int], values: NDArray[np.float16]) -> None:
+        try:
+            for i, value in zip(indices, values, strict=True):
+                self._table[i] = value
+        except OSError as e:
+            raise DatasetError(
+                f"{self.path}: cannot write ({e}); run the same command again to go on"
+            ) from None
 
     def load(self, indices: NDArray[np.integer] | range | None = None) -> Tables:
         """The tables (float16) of `indices`, or of all materials. A missing or damaged chunk raises `DatasetError`."""
         indices = np.arange(self.settings.materials) if indices is None else np.asarray(indices)
         values = np.empty((len(indices), *ISOTROPIC.shape), np.float16)
         for row, i in enumerate(indices):
-            if not self._chunk(i).exists():
+            if not 0 <= i < self.settings.materials:
+                raise DatasetError(
+                    f"{self.path} has {self.settings.materials} materials, none with number {i}"
+                )
+            if not self._has(i):
                 raise DatasetError(
                     f"{self.path}: material {i} is missing ({len(self.missing())} are); "
                     f"run `nma dataset {self.settings.class_name} {self.path}` with its settings to complete it"
@@ -140,11 +179,30 @@ class Dataset:
             try:
                 values[row] = self._table[int(i)]
             except Exception as e:
+                reason = str(e).partition("\n")[0] or type(e).__name__
                 raise DatasetError(
-                    f"{self.path}: chunk {self._chunk(i)} is damaged ({e}); delete that file and run `nma dataset` again"
+                    f"{self.path}: chunk {self._chunk(i)} is damaged ({reason}); "
+                    "delete that file and run `nma dataset` again"
                 ) from None
         walks = np.full(len(indices), ISOTROPIC.walks(self.settings.walks), np.int64)
         return Tables(draw_params(self.settings, indices), values, walks)
+
+
+def _create_array(path: Path, settings: Settings) -> None:
+    """An empty dataset at `path`, unless another worker is faster."""
+    try:
+        with suppress(ContainsArrayError):
+            zarr.create_array(
+                store=path,
+                shape=(settings.materials, *ISOTROPIC.shape),
+                chunks=(1, *ISOTROPIC.shape),
+                dtype="float16",
+                serializer=BytesCodec(),
+                compressors=[ZstdCodec(level=1), Crc32cCodec()],
+                attributes={"nma_dataset": asdict(settings), "nma_params": _fingerprint(settings)},
+            )
+    except OSError as e:
+        raise DatasetError(f"{path}: cannot create a dataset there ({e})") from None
 
 
 def stream(settings: Settings, block: int = _BLOCK, first: int = 0) -> Iterator[Tables]:

@@ -187,7 +187,7 @@ def tabulate(
     return Tables(params, values.reshape(shape), np.full(len(params), total, np.int64), standard_error)
 
 
-def stream_keys(seed: int, indices: NDArray[np.integer] | range) -> NDArray[np.uint64]:
+def stream_keys(seed: int, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.uint64]:
     """Random-stream keys of materials: each depends on the seed and the material's own index alone."""
     return np.array(
         [np.random.SeedSequence((seed, int(i), 0x77A1)).generate_state(1, np.uint64)[0] for i in indices]
