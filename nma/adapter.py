@@ -55,13 +55,18 @@ class Adapter:
                 f"'{name_or_path}' is neither a file nor a shipped adapter ({', '.join(shipped())})"
             )
         header, layers = weights.read(path)
+        try:
+            target = params_from_json(header.target)
+            encoding.get(header.encoding)
+        except (WeightsError, TypeError) as e:
+            raise WeightsError(f"{path}: {e}") from None
         adapter = Adapter(
             SPACES[header.class_name],
             header.encoding,
             layers,
             header.instances,
             header.directional,
-            params_from_json(header.target),
+            target,
             header.training,
         )
         adapter._check(path, header.dialect)
@@ -115,14 +120,17 @@ class Adapter:
         return np.stack(lanes, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
 
     def _check(self, path: Path, dialect: str) -> None:
-        """Refuses a network that does not fit its own description."""
-        inputs = encoding.size(self.encoding, self.space, self.directional)
-        if self.layers[0][0].shape[1] != inputs or self.layers[-1][0].shape[0] != self.size:
-            raise WeightsError(
-                f"{path}: the network maps {self.layers[0][0].shape[1]} inputs to {self.layers[-1][0].shape[0]} outputs, "
-                f"its description says {inputs} to {self.size}; train again"
-            )
+        """Refuses a network that does not fit its own description, or this version's target."""
         if dialect != DIALECT:
             raise WeightsError(
                 f"{path}: written for the Principled dialect '{dialect}', this version evaluates '{DIALECT}'"
+            )
+        if self.instances < 1:
+            raise WeightsError(f"{path}: a blend of {self.instances} instances; train again")
+        inputs = encoding.size(self.encoding, self.space, self.directional)
+        found = self.layers[0][0].shape[1], self.layers[-1][0].shape[0]
+        if found != (inputs, self.size):
+            raise WeightsError(
+                f"{path}: the network maps {found[0]} inputs to {found[1]} outputs, "
+                f"its description says {inputs} to {self.size}; train again"
             )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import ops
+from nma.errors import NmaError
 from nma.ops import Float
 
 # Share of He's random matrix in hidden layers that start near the identity.
@@ -64,5 +65,5 @@ def hidden(name: str) -> list[int]:
     """Hidden layer sizes of a network named like "5x64"."""
     depth, _, width = name.partition("x")
     if not (depth.isdigit() and width.isdigit() and int(depth) > 0 and int(width) > 0):
-        raise ValueError(f"a network is written as DEPTHxWIDTH, for example 5x64; got '{name}'")
+        raise NmaError(f"a network is written as DEPTHxWIDTH, for example 5x64; got '{name}'")
     return [int(width)] * int(depth)

@@ -1,7 +1,7 @@
 """The weights file: safetensors, with everything needed to use the network as JSON in its header.
 
-Tensors `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight`, ... float32. The header's metadata has one entry,
-`nma`, a JSON object with the fields of `Header`.
+Tensors `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight`, ... float32. The header's metadata has one
+entry, `nma`, a JSON object with the fields of `Header`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin, get_type_hints
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -27,9 +27,9 @@ FORMAT = 1
 class Header:
     """What a weights file says about itself.
 
-    `parameters` repeats the class's declaration, so that other languages need no Python. `reciprocal` holds for adapters
-    whose target does not depend on the view direction. `target` lists the target's numbers with their ranges, `dialect`
-    names the Principled BRDF meant. `training` is the record of how the weights came to be.
+    `parameters` repeats the class's declaration, so that other languages need no Python. `reciprocal` holds for
+    adapters whose target does not depend on the view direction. `target` lists the target's numbers with their ranges,
+    `dialect` names the Principled BRDF meant. `training` is the record of how the weights came to be.
     """
 
     class_name: str
@@ -73,20 +73,31 @@ def read(path: str | Path) -> tuple[Header, Layers]:
         with safe_open(path, framework="numpy") as f:
             metadata = f.metadata() or {}
             tensors = {name: f.get_tensor(name) for name in f.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as e:
+    except (SafetensorError, OSError, ValueError, TypeError) as e:
         raise WeightsError(
             f"{path}: truncated, or not a safetensors file ({e}); copy or train it again"
         ) from None
     if "nma" not in metadata:
         raise WeightsError(f"{path}: a safetensors file without NMA metadata; `nma train` writes adapters")
+    header = _header(path, metadata["nma"])
+    _check_class(path, header)
+    return header, _layers(path, header, tensors)
+
+
+def _header(path: Path, text: str) -> Header:
+    """The header from its JSON, every field of the type that it is declared with."""
     try:
-        header = Header(**json.loads(metadata["nma"]))
-    except (TypeError, json.JSONDecodeError) as e:
+        header = Header(**json.loads(text))
+    except (TypeError, ValueError) as e:
         raise WeightsError(
             f"{path}: metadata of another version ({e}); upgrade the package or train again"
         ) from None
-    _check_class(path, header)
-    return header, _layers(path, header, tensors)
+    for name, hint in get_type_hints(Header).items():
+        if not isinstance(getattr(header, name), get_origin(hint) or hint):
+            raise WeightsError(
+                f"{path}: its metadata has {getattr(header, name)!r} as '{name}'; copy or train it again"
+            )
+    return header
 
 
 def _check_class(path: Path, header: Header) -> None:
@@ -100,10 +111,17 @@ def _check_class(path: Path, header: Header) -> None:
         raise WeightsError(
             f"{path}: made for class '{header.class_name}'; this version knows {', '.join(SPACES)}"
         )
-    names = [(p["name"], p["size"]) for p in header.parameters]
-    if names != [(p.name, p.size) for p in space.params]:
+    keys = ("name", "size", "law", "low", "high")
+    for number, declared in enumerate(describe(space)):
+        theirs = header.parameters[number] if number < len(header.parameters) else None
+        if not isinstance(theirs, dict) or any(theirs.get(k) != declared[k] for k in keys):
+            raise WeightsError(
+                f"{path}: its class '{header.class_name}' differs from this version's in parameter {number}, "
+                f"{declared['name']}; use the version that wrote it, or train again"
+            )
+    if len(header.parameters) > len(space.params):
         raise WeightsError(
-            f"{path}: its class '{header.class_name}' has the parameters {names}, unlike this version's"
+            f"{path}: its class '{header.class_name}' has more parameters than this version's; upgrade the package"
         )
 
 
@@ -115,12 +133,16 @@ def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layer
             matrix, bias = tensors[f"layer{number}.weight"], tensors[f"layer{number}.bias"]
         except KeyError as e:
             raise WeightsError(f"{path}: tensor {e} is missing; copy or train it again") from None
-        fan_in = layers[-1][0].shape[0] if layers else matrix.shape[-1]
+        fan_in = layers[-1][0].shape[0] if layers else matrix.shape[-1] if matrix.ndim else 0
         if matrix.ndim != 2 or matrix.shape[1] != fan_in or bias.shape != matrix.shape[:1]:
             raise WeightsError(
                 f"{path}: layer {number} has shapes {matrix.shape} and {bias.shape}, which do not fit"
             )
         if not (np.isfinite(matrix).all() and np.isfinite(bias).all()):
             raise WeightsError(f"{path}: layer {number} holds numbers that are not finite; train again")
-        layers.append((matrix, bias))
+        layers.append((matrix.astype(np.float32), bias.astype(np.float32)))
+    if [m.shape[0] for m, _ in layers[:-1]] != header.hidden:
+        raise WeightsError(
+            f"{path}: its hidden layers are not the {header.hidden} of its metadata; train again"
+        )
     return layers
