@@ -181,8 +181,9 @@ def demo(
     nma.render.use(variant)
     with _samples_bar("demo", demonstration.total_samples(settings)) as advance:
         lines = demonstration.demo(output, settings, advance)
-    headings = demonstration.HEADINGS
-    console.out.print(console.table(headings, [line.cells() for line in lines]))
+    for material in dict.fromkeys(line.material for line in lines):
+        rows = [line.cells()[1:] for line in lines if line.material == material]
+        console.out.print(console.table(demonstration.HEADINGS[1:], rows, material))
     console.out.print(demonstration.note(settings), highlight=False)
     console.err.print(f"[bold]{output}[/bold] shows the pictures")
 
@@ -224,13 +225,13 @@ def _load_file(
 
 
 def _renderings(material: Material, view: _View, seed: int, adapter: str, clamp: bool) -> dict[str, Any]:
-    """A material by its adapter, by its reference, and by the reference with another seed."""
+    """A material by its adapter, by its reference, and by the reference again, each with a seed of its own."""
     by_adapter = view.load(material, "nma", adapter, clamp)
     by_walks = view.load(material, "layered")
     return {
         "adapter": _render(by_adapter, view.spp, seed, "adapter"),
         "noise": _render(by_walks, view.spp, seed + 1, "reference again"),
-        "reference": _render(by_walks, view.spp, seed, "reference"),
+        "reference": _render(by_walks, view.spp, seed + 2, "reference"),
     }
 
 

@@ -13,11 +13,11 @@ from __future__ import annotations
 from nma.errors import ParamError
 from nma.jit import dr
 from nma.llvm import ensure_llvm
-from nma.render.register import register
+from nma.render import register as _plugins
 
 __all__ = ["use"]
 
-register()
+_plugins.register()
 
 
 def use(variant: str = "auto") -> str:

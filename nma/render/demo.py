@@ -79,10 +79,9 @@ def demo(
         rows.append(_row(label, truth, added[1], added[2], settings))
         lines += added
     table = [HEADINGS, *(line.cells() for line in lines)]
-    title = "A layered material: simulated in every shading point, and translated by its adapter"
-    contact_sheet(
-        path, rows, ("reference", "adapter", "difference"), title=title, table=table, note=note(settings)
-    )
+    columns = ("reference: layered", "adapter: nma", "difference: FLIP")
+    title = "Layered materials, simulated and by their adapter"
+    contact_sheet(path, rows, columns, title=title, table=table, note=note(settings))
     return lines
 
 
@@ -99,11 +98,11 @@ def note(settings: Settings) -> str:
     width, height = settings.size
     samples = settings.spp * settings.runs
     return (
-        f"Time and variance: one frame of {width} x {height} pixels, {settings.spp} spp, path depth {DEPTH}; "
+        f"Time and variance: one frame of {width} x {height} pixels, {settings.spp} spp, path depth {DEPTH};\n"
         f"median and variance of {settings.runs} seeds. Efficiency: 1 / (variance x time).\n"
-        f"Errors: mean of the {settings.runs} frames ({samples} spp) against the reference of "
-        f"{settings.reference_spp} spp; those of `layered` are noise alone.\n"
-        f"`principled` is a stand-in for its time, textured alike. Difference: FLIP, black 0 to yellow {FLIP_SCALE:g}. "
+        f"Errors: mean of these frames ({samples} spp) against a reference of {settings.reference_spp} spp; "
+        "`layered` has noise alone.\n"
+        f"`principled` is a stand-in for its time, textured alike. FLIP: black 0 to yellow {FLIP_SCALE:g}.\n"
         f"Mitsuba {mi.__version__}, {mi.variant()}, {os.cpu_count()} CPU cores; adapter {Path(settings.adapter).stem}."
     )
 
@@ -155,13 +154,15 @@ def _row(label: str, truth: NDArray[np.float32], reference: Line, adapter: Line,
     """The pictures of one scene, with time, variance and error under them."""
     difference = difference_image(adapter.measured.mean, truth, kind="flip", scale=FLIP_SCALE)
     captions = [_caption(line, settings) for line in (reference, adapter)]
-    captions.append(f"FLIP {adapter.errors['flip_ldr']:.4f}, HDR-FLIP {adapter.errors['flip_hdr']:.4f}")
+    captions.append(
+        f"mean {adapter.errors['flip_ldr']:.4f}, of noise alone {reference.errors['flip_ldr']:.4f}"
+    )
     return Row(label, [truth, adapter.measured.mean, difference], captions)
 
 
 def _caption(line: Line, settings: Settings) -> str:
-    m = line.measured
+    m, errors = line.measured, line.errors
     return (
-        f"{line.bsdf}, {settings.spp} spp: {m.seconds:.2f} s, variance {m.mean_variance:.1e}\n"
-        f"error: HDR-FLIP {line.errors['flip_hdr']:.4f}, SMAPE {line.errors['smape']:.4f}"
+        f"{settings.spp} spp: {m.seconds:.2f} s, variance {m.mean_variance:.1e}\n"
+        f"HDR-FLIP {errors['flip_hdr']:.4f}, SMAPE {errors['smape']:.4f}"
     )
