@@ -158,7 +158,9 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     """A named material's values; its textures as Mitsuba's."""
     import mitsuba as mi
 
-    material = materials.load(name)
+    # Files lie beside the scene, as those of Mitsuba's own plugins do.
+    found = mi.file_resolver().resolve(name) if name.endswith(".toml") else name
+    material = materials.load(str(found))
     if material.class_name != space.name:
         raise ParamError(f"material '{name}' is of class {material.class_name}, wanted is {space.name}")
     return {
