@@ -86,7 +86,7 @@ def fresnel_conductor(cos_i: Float, eta: Float, k: Float) -> Float:
     t1 = a2b2 + cos2
     t2 = 2.0 * cos_i * a
     r_s = (t1 - t2) / (t1 + t2)
-    t3 = cos2 * a2b2 + sin2 * sin2
+    t3 = cos2 * a2b2 + sin2 * sin2 + 1e-30  # an index of 0 + 0i reflects everything, at normal incidence too
     t4 = t2 * sin2
     r_p = r_s * (t3 - t4) / (t3 + t4)
     return 0.5 * (r_s + r_p)

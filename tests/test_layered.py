@@ -171,6 +171,30 @@ def test_reciprocity(case):
         assert abs(forth.mean() - back.mean()) < limit(2) * error + 1e-6
 
 
+def test_finite_everywhere():
+    """Random materials over the valid range, corners included, and directions down to the horizon."""
+    n, rng = 1 << 18, np.random.default_rng(2)
+
+    def spread(low, high, log=False):
+        """Values over a range, a third of them at its ends."""
+        u = np.clip(rng.uniform(-0.25, 1.25, n), 0.0, 1.0)
+        return Float((low * (high / low) ** u if log else low + u * (high - low)).astype(np.float32))
+
+    bounds = [p.bounds("valid") for p in LAYERED3.params for _ in range(p.size)]
+    columns = [spread(low, min(high, 20.0), log=i < 2) for i, (low, high) in enumerate(bounds)]
+    layers = layered_eval.settle(Layered3().gather(columns))
+    wi, wo = direction(spread(1e-7, 1.0, log=True)), direction(spread(1e-7, 1.0, log=True))
+    phi = spread(0.0, 2.0 * np.pi)
+    turned = Vec3(wo.x * dr.cos(phi), wo.x * dr.sin(phi), wo.z)
+    for out in (turned, wi, Vec3(-wi.x, -wi.y, wi.z)):
+        pdf = layered_eval.pdf(layers, wi, out).numpy()
+        assert np.isfinite(pdf).all()
+        assert (pdf > 0).all()
+        value = np.array([c.numpy() for c in layered_eval.evaluate(layers, wi, out, PCG32(n, 3))])
+        assert np.isfinite(value).all()
+        assert (value >= 0).all()
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_density_follows_the_walk(case):
     """What walks and lobes draw has density, and estimates weighed by it vary little."""

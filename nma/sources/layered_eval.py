@@ -222,7 +222,7 @@ def _out_through_coat(layers: Layers, wo: Vec3, up: Vec3) -> tuple[Float, Float]
     passes = ops.select(matched, 1.0, 1.0 - fresnel) * smith_g1(up, alpha, alpha)
     t = passes * wo.z / (eta * eta * ops.maximum(up.z, 1e-7))
     valid = matched | ((m.z > 0) & (cos_o > 0) & (cos_up > 0))
-    return ops.select(valid, q, 0.0), ops.select(valid, t, 0.0)
+    return ops.select(valid & ~matched, q, 0.0), ops.select(valid, t, 0.0)
 
 
 def _mirror_pdf(w: Vec3, out: Vec3, alpha: Float) -> Float:
