@@ -1,0 +1,299 @@
+"""Points inside the bins of a table: weighted means of known functions, and of lobes far narrower than a bin.
+
+Estimates are repeated with independent random shifts of their lattice; Student's t-tests compare their mean with the
+known value. Each test shares the false-alarm rate `FALSE_ALARM` among its comparisons (Sidak); seeds are fixed.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from nma import ava, ops
+from nma.jit import dr
+from nma.microfacet import ggx_d, smith_g1
+from nma.ops import Vec3
+from nma.table import Grid
+
+FALSE_ALARM = 1e-3
+REPEATS = 16
+LAST = 39
+
+# Bins (theta_i, theta_o, phi) of every kind: grazing, normal incidence, mirror direction and its neighbours, far away.
+BINS = np.array(
+    [
+        (0, 0, 0),
+        (0, 0, LAST),
+        (0, LAST, 20),
+        (LAST, LAST, 0),
+        (LAST, LAST, LAST),
+        (LAST, 0, LAST),
+        (20, 20, LAST),
+        (20, 21, LAST),
+        (20, 19, 38),
+        (20, 20, 38),
+        (1, 1, LAST),
+        (1, 0, LAST),
+        (38, LAST, LAST),
+        (5, 30, 10),
+        (30, 5, 35),
+    ],
+    np.float64,
+)
+
+
+def shifted(n, shape, seed):
+    """The lattice of n points (3, n, *shape), shifted at random for each entry."""
+    shift = np.random.default_rng(seed).random((3, 1, *shape))
+    lattice = ava.lattice(n).T.reshape(3, n, *(1,) * len(shape))
+    return (lattice + shift) % 1.0
+
+
+def crowded(bins, n, seed, repeats=REPEATS):
+    """Points (n, repeats, bins) of `bin_points`."""
+    i, o, p = bins.T
+    return ava.bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
+
+
+def uniform(bins, n, seed, repeats=REPEATS):
+    i, o, p = bins.T
+    return ava.uniform_bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
+
+
+def assert_means(estimates, expected):
+    """t-tests of the mean over axis 0, the repetitions, of `estimates` (repeats, ...) against `expected` (...)."""
+    mean, spread = estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / math.sqrt(len(estimates))
+    # Below this the rounding of single numbers shows.
+    t = np.abs(mean - expected) / np.maximum(spread, 1e-7 * np.abs(expected) + 1e-12)
+    limit = stats.t.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / t.size)), len(estimates) - 1)
+    worst = np.unravel_index(np.argmax(t), t.shape)
+    assert t[worst] < limit, (
+        f"{worst}: {mean[worst]} +- {spread[worst]}, expected {np.broadcast_to(expected, t.shape)[worst]}"
+    )
+
+
+def azimuth_away(points):
+    """How far wo lies from the azimuth of the mirror direction, 0 .. pi."""
+    return np.abs(np.arctan2(points.wo.y, -points.wo.x))
+
+
+@pytest.mark.parametrize("law", (crowded, uniform))
+def test_means_of_smooth_functions_are_exact(law):
+    """Moments of both cosines, of their product and of the azimuth: the weights have mean 1 and no preference."""
+    points = law(BINS, 2048, 1)
+    i, o, p = BINS.T
+    width, step = 1.0 / 40, math.pi / 40
+    mu_i, mu_o, psi = (i + 0.5) * width, (o + 0.5) * width, (39.5 - p) * step
+    cos_psi = (np.sin(psi + 0.5 * step) - np.sin(psi - 0.5 * step)) / step
+    a, b, away = points.wi.z, points.wo.z, azimuth_away(points)
+    for function, expected in (
+        (1.0, np.ones(len(BINS))),
+        (a, mu_i),
+        (b, mu_o),
+        (a * b, mu_i * mu_o),
+        (a * a, mu_i**2 + width**2 / 12),
+        ((b - a) ** 2, (mu_o - mu_i) ** 2 + width**2 / 6),
+        (away, psi),
+        (np.cos(away), cos_psi),
+        (a * np.cos(away), mu_i * cos_psi),
+    ):
+        assert_means((points.weight * function).mean(axis=0), expected)
+
+
+def test_means_at_one_view_direction_are_exact():
+    """`bin_points_at` averages over wo alone, at any cosine, also one outside of the mirror's bin."""
+    cosines = np.array([1e-6, 0.012, 0.3, 0.51, 0.99, 1.0])
+    mu, which = (x.ravel() for x in np.meshgrid(cosines, np.arange(len(BINS)), indexing="ij"))
+    _, o, p = BINS[which.astype(int)].T
+    u = shifted(1024, (REPEATS, len(mu)), 2)
+    points = ava.bin_points_at(np.broadcast_to(mu, u[0].shape), o, p, tuple(u[:2]))
+    width, step = 1.0 / 40, math.pi / 40
+    mu_o, psi = (o + 0.5) * width, (39.5 - p) * step
+    away = azimuth_away(points)
+    for function, expected in (
+        (1.0, np.ones(len(mu))),
+        (points.wo.z, mu_o),
+        (points.wo.z**2, mu_o**2 + width**2 / 12),
+        (away, psi),
+        (points.wo.z * away, mu_o * psi),
+    ):
+        assert_means((points.weight * function).mean(axis=0), expected)
+
+
+@pytest.mark.parametrize("dtype", (np.float32, np.float64))
+@pytest.mark.parametrize("law", (ava.bin_points, ava.uniform_bin_points), ids=("crowded", "uniform"))
+def test_points_lie_in_their_bins(law, dtype):
+    """All 64,000 bins, at random points and at the ends of the unit cube."""
+    i, o, p = (x.ravel().astype(dtype) for x in np.meshgrid(*[np.arange(40)] * 3, indexing="ij"))
+    rng = np.random.default_rng(3)
+    below_one = np.nextafter(dtype(1), dtype(0))
+    corners = [np.full((3, len(i)), u, dtype) for u in (0.0, below_one)]
+    # Cosines are kept 1e-6 away from the horizon, which may push the other direction's beyond its bin by as much.
+    slack = 1e-6 + 4 * np.finfo(dtype).eps
+    for u in (*corners, rng.random((3, len(i)), dtype), rng.integers(0, 2, (3, len(i))) * below_one):
+        points = law(i, o, p, tuple(u.astype(dtype)))
+        assert_in_bins(points, i, o, p, slack)
+        assert all(x.dtype == dtype for x in (*points.wi, *points.wo, points.weight))
+
+
+def assert_in_bins(points, i, o, p, slack):
+    for mu, k in ((points.wi.z, i), (points.wo.z, o)):
+        assert np.isfinite(mu).all()
+        assert (mu >= k / 40 - slack).all()
+        assert (mu <= (k + 1) / 40 + slack).all()
+        assert mu.min() > 0
+        assert mu.max() <= 1
+    # wi lies at azimuth 0; on the vertical, azimuths mean nothing.
+    assert (points.wi.y == 0).all()
+    away = azimuth_away(points)
+    clear = points.wo.z < 1.0 - 1e-5
+    psi_slack = 10 * slack
+    assert (away >= (39 - p) * math.pi / 40 - psi_slack)[clear].all()
+    assert (away <= (40 - p) * math.pi / 40 + psi_slack)[clear].all()
+    for w in (points.wi, points.wo):
+        np.testing.assert_allclose(ops.dot(w, w), 1.0, atol=1e-6)
+    assert np.isfinite(points.weight).all()
+    assert (points.weight >= 0).all()
+
+
+def test_points_at_a_cosine_lie_in_their_bins():
+    o, p = (x.ravel().astype(np.float32) for x in np.meshgrid(np.arange(40), np.arange(40), indexing="ij"))
+    rng = np.random.default_rng(4)
+    for mu in (0.0, 1e-6, 0.0125, 0.5, 0.9999, 1.0):
+        cosine = np.full(len(o), mu, np.float32)
+        for u in (np.zeros((2, len(o))), np.full((2, len(o)), 1 - 6e-8), rng.random((2, len(o)))):
+            points = ava.bin_points_at(cosine, o, p, tuple(u.astype(np.float32)))
+            i = np.minimum(np.floor(cosine * 40), 39)
+            if mu == 0.0:
+                points = points._replace(wi=points.wi._replace(z=cosine + 1e-9))
+            assert_in_bins(points, i, o, p, 2e-6)
+
+
+def lobe(wi, wo, alpha):
+    """f cos(theta_o) of a white GGX mirror [1/sr]. Walter 2007, eq. 20."""
+    m = ops.normalize(wi + wo)
+    return ggx_d(m, alpha, alpha) * smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha) / (4.0 * wi.z)
+
+
+@pytest.mark.parametrize("name", ("numpy", "drjit"))
+def test_single_precision_is_enough_for_the_narrowest_lobe(name):
+    """In all bins near the mirror direction, half vectors keep enough digits to evaluate a lobe of alpha .001."""
+    i, o, p = (x.ravel() for x in np.meshgrid(np.arange(40.0), [-1, 0, 1], [38.0, 39.0], indexing="ij"))
+    o = np.clip(i + o, 0, 39)
+    u = np.random.default_rng(5).random((3, 50, len(i)), np.float32).astype(np.float64)
+    exact = ava.bin_points(i, o, p, tuple(u))
+    expected = (exact.weight * lobe(exact.wi, exact.wo, 0.001)).ravel()
+    i, o, p = (np.broadcast_to(x, u[0].shape) for x in (i, o, p))
+    array = (lambda x: x) if name == "numpy" else dr.auto.Float
+    bins = [array(np.ascontiguousarray(x, np.float32).ravel()) for x in (i, o, p, *u)]
+    points = ava.bin_points(*bins[:3], tuple(bins[3:]))
+    found = points.weight * lobe(points.wi, points.wo, 0.001)
+    found = found if name == "numpy" else found.numpy()
+    error = np.abs(found - expected) / expected
+    assert np.median(error) < 1e-3
+    assert error.max() < 0.1
+
+
+def graded(n):
+    """Nodes and weights on 0 .. 1 that crowd towards both ends."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    t = 0.5 * (x + 1.0)
+    # The regularised incomplete beta function B(4, 4), smooth and flat at both ends.
+    return t**4 * (35 - 84 * t + 70 * t**2 - 20 * t**3), 0.5 * w * 140 * t**3 * (1 - t) ** 3
+
+
+def peaked(low, high, scale, n):
+    """Nodes and weights on low .. high that crowd around 0: x = scale sinh t."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    start, stop = np.arcsinh(low / scale), np.arcsinh(high / scale)
+    t = start + 0.5 * (x + 1.0) * (stop - start)
+    return scale * np.sinh(t), scale * np.cosh(t) * 0.5 * w * (stop - start)
+
+
+def mean_at(mu_i, o, p, alpha, n):
+    """Mean of the lobe over the bin (o, p) of wo for one wi, by quadrature."""
+    sin_i = math.sqrt(1.0 - mu_i * mu_i)
+    s, ws = peaked(o / 40 - mu_i, (o + 1) / 40 - mu_i, 2 * alpha * sin_i, n)
+    psi, wp = peaked((39 - p) * math.pi / 40, (40 - p) * math.pi / 40, 2 * alpha * mu_i / sin_i, n)
+    mu_o, psi = np.meshgrid(mu_i + s, psi, indexing="ij")
+    sin_o = np.sqrt(1.0 - mu_o * mu_o)
+    wi = Vec3(np.full_like(mu_o, sin_i), 0.0 * mu_o, np.full_like(mu_o, mu_i))
+    value = lobe(wi, Vec3(-sin_o * np.cos(psi), sin_o * np.sin(psi), mu_o), alpha)
+    return ws @ value @ wp * 40 * 40 / math.pi
+
+
+def mean_of_bin(i, o, p, alpha, nodes=80, n=48):
+    """Mean of the lobe over the whole bin, by brute force."""
+    t, w = graded(nodes)
+    return sum(wk * mean_at((i + tk) / 40, o, p, alpha, n) for tk, wk in zip(t, w, strict=True))
+
+
+LOBE_BINS = ((20, 20, 39), (20, 21, 39), (20, 20, 38), (4, 4, 39), (35, 34, 39))
+
+
+@pytest.fixture(scope="module")
+def lobe_means():
+    """Means of a lobe of alpha .001 over `LOBE_BINS`, from 184,320 nodes each."""
+    return np.array([mean_of_bin(*bin, 0.001) for bin in LOBE_BINS])
+
+
+def test_the_quadrature_has_converged(lobe_means):
+    """With half as many nodes again in every dimension it agrees to a thousandth."""
+    assert mean_of_bin(*LOBE_BINS[0], 0.001, 120, 72) == pytest.approx(lobe_means[0], rel=1e-3)
+
+
+def test_means_of_a_lobe_of_alpha_001_are_exact(lobe_means):
+    points = crowded(np.array(LOBE_BINS, np.float64), 1 << 13, 6)
+    estimates = (points.weight * lobe(points.wi, points.wo, 0.001)).mean(axis=0)
+    assert_means(estimates / lobe_means, 1.0)
+    # And precise enough for that to mean something.
+    assert (estimates.std(axis=0, ddof=1) / math.sqrt(REPEATS) < 0.01 * lobe_means).all()
+
+
+def test_a_few_crowded_points_see_what_uniform_points_miss(lobe_means):
+    """The standard deviation of an estimate from 20 points of the mirror bin's mean, in terms of the mean."""
+    mirror = np.array(LOBE_BINS[:1], np.float64)
+    spread = []
+    for law in (crowded, uniform):
+        points = law(mirror, 20, 7, 500)
+        spread.append(
+            np.std((points.weight * lobe(points.wi, points.wo, 0.001)).mean(axis=0)) / lobe_means[0]
+        )
+    assert spread[0] < 1.0
+    assert spread[1] > 3 * spread[0]
+
+
+@pytest.mark.parametrize("alpha", (0.001, 0.02, 0.3))
+def test_means_at_one_view_direction_of_lobes_are_exact(alpha):
+    cases = [(0.5123, 20, 39), (0.5123, 21, 39), (0.5001, 20, 39), (0.05, 2, 39), (0.98, 39, 37)]
+    mu, o, p = np.array(cases).T
+    expected = np.array([mean_at(m, int(a), int(b), alpha, 200) for m, a, b in cases])
+    u = shifted(1 << 12, (REPEATS, len(cases)), 8)
+    points = ava.bin_points_at(np.broadcast_to(mu, u[0].shape), o, p, tuple(u[:2]))
+    estimates = (points.weight * lobe(points.wi, points.wo, alpha)).mean(axis=0)
+    assert_means(estimates / expected, 1.0)
+
+
+def test_other_grids_work_too():
+    grid = Grid(8, 8, 5)
+    bins = np.array([(0, 0, 4), (7, 7, 4), (3, 5, 0)], np.float64)
+    i, o, p = bins.T
+    for law in (ava.bin_points, ava.uniform_bin_points):
+        points = law(i, o, p, tuple(shifted(2048, (REPEATS, 3), 9)), grid)
+        for function, expected in (
+            (1.0, np.ones(3)),
+            (points.wi.z, (i + 0.5) / 8),
+            (points.wo.z, (o + 0.5) / 8),
+            (azimuth_away(points), (4.5 - p) * math.pi / 5),
+        ):
+            assert_means((points.weight * function).mean(axis=0), expected)
+
+
+def test_lattice_points_are_well_spread():
+    """Every one of 512 cells of the cube holds about its share of 4096 points."""
+    points = ava.lattice(4096)
+    assert points.shape == (4096, 3)
+    cells = np.bincount((points * 8).astype(int) @ [64, 8, 1], minlength=512)
+    assert cells.min() >= 4
+    assert cells.max() <= 12
