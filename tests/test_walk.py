@@ -27,11 +27,16 @@ BLACK = {"eta_conductor": 1.0, "k_conductor": 0.0, "alpha_bottom": 1e-4}
 FLAT = {"alpha_top": 1e-7, "alpha_bottom": 1e-7}
 
 
+def lanes(value, n):
+    """The value in n lanes, without becoming a constant of the kernel: all materials share one."""
+    return dr.opaque(Float, float(value)) + dr.zeros(Float, n)
+
+
 def albedo(mu, n=WALKS, seed=1, **values):
     """Mean throughput of n walks from cos(theta_i) = mu, and its standard error, each (3,)."""
     source = Layered3()
-    columns = [dr.full(Float, c, n) for c in LAYERED3.vector({"albedo": 1.0, "sigma_t": 0.0, **values})]
-    wi = Vec3(dr.full(Float, np.sqrt(1.0 - mu * mu), n), dr.zeros(Float, n), dr.full(Float, mu, n))
+    columns = [lanes(c, n) for c in LAYERED3.vector({"albedo": 1.0, "sigma_t": 0.0, **values})]
+    wi = Vec3(lanes(np.sqrt(1.0 - mu * mu), n), dr.zeros(Float, n), lanes(mu, n))
     wo, throughput = walk(source, source.gather(columns), wi, PCG32(n, seed))
     t = np.array([c.numpy() for c in throughput], np.float64)
     assert (wo.z.numpy()[t.max(axis=0) > 0] > 0).all()
