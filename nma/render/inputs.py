@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -57,10 +58,10 @@ class Inputs:
             if param.name in self.textured:
                 value = value.eval(si, active)
                 channels = [value.x, value.y, value.z][: param.size]
-                if param.name in self._moved:
-                    channels = [ops.clip(c, *_finite(param.bounds(self.bounds))) for c in channels]
             else:
                 channels = [value] if param.size == 1 else [value.x, value.y, value.z]
+            if param.name in self._moved:
+                channels = [ops.clip(c, *_finite(param.bounds(self.bounds))) for c in channels]
             out += channels
         return out
 
@@ -76,21 +77,31 @@ class Inputs:
 
     _moved: frozenset[str] = frozenset()
 
+    def check(self, names: Iterable[str] = ()) -> None:
+        """Checks inputs again after they were changed in place: those that `names` start with, or all without names."""
+        import mitsuba as mi
+
+        chosen = {name.partition(".")[0] for name in names}
+        for param in self.space.params:
+            value = self.values[param.name]
+            if chosen and param.name not in chosen:
+                continue
+            if isinstance(value, mi.Texture):
+                _check_texture(param, value, self.bounds, self.clamp)
+            else:
+                _check_numbers(param, value, self.bounds, self.clamp)
+
     def _checked(self, param: Param, value: Any) -> Any:
         """The input, within bounds, in the form of `values`."""
         import mitsuba as mi
 
+        if self.clamp:
+            self._moved |= {param.name}
         if isinstance(value, mi.Texture):
-            if not _check_texture(param, value, self.bounds, self.clamp) or self.clamp:
+            if not _check_texture(param, value, self.bounds, self.clamp):
                 self._moved |= {param.name}
             return value
-        numbers = np.broadcast_to(np.asarray(value, np.float64), param.size)
-        low, high = param.bounds(self.bounds)
-        slack = 1e-6 * max(abs(low), 1.0)
-        inside = np.isfinite(numbers) & (self.clamp | ((numbers >= low - slack) & (numbers <= high + slack)))
-        if not inside.all():
-            raise ParamError(f"{param.name} is {_plain(numbers)}, allowed is {_range(param, self.bounds)}")
-        numbers = np.clip(numbers, low, high).tolist()
+        numbers = _check_numbers(param, value, self.bounds, self.clamp).tolist()
         return mi.Float(numbers[0]) if param.size == 1 else mi.Color3f(numbers)
 
 
@@ -124,6 +135,20 @@ def _constant(texture: Any) -> Any:
     if texture.is_spatially_varying() or "value" not in params:
         return texture
     return [float(channel) for channel in np.ravel(params["value"])]
+
+
+def _check_numbers(param: Param, value: Any, bounds: Bounds, clamp: bool) -> NDArray:
+    """The parameter's numbers, within bounds."""
+    numbers = np.asarray(value, np.float64).ravel()
+    numbers = np.broadcast_to(numbers, param.size) if numbers.size == 1 else numbers
+    low, high = param.bounds(bounds)
+    slack = 1e-6 * max(abs(low), 1.0)
+    inside = np.isfinite(numbers) & (clamp | ((numbers >= low - slack) & (numbers <= high + slack)))
+    if numbers.size != param.size:
+        raise ParamError(f"{param.name} wants {param.size} number(s), got {numbers.size}")
+    if not inside.all():
+        raise ParamError(f"{param.name} is {_plain(numbers)}, allowed is {_range(param, bounds)}")
+    return np.clip(numbers, low, high)
 
 
 def _check_texture(param: Param, texture: Any, bounds: Bounds, clamp: bool) -> bool:
@@ -171,7 +196,11 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
 
 def _range(param: Param, bounds: Bounds) -> str:
     low, high = param.bounds(bounds)
-    hint = ", the range that the adapter was trained on" if bounds == "training" else ""
+    hint = (
+        ", the range that the adapter was trained on; set `clamp` to move it there"
+        if bounds == "training"
+        else ""
+    )
     return f"{low:g} .. {high:g}" + hint
 
 

@@ -7,6 +7,7 @@ import importlib
 # Name of the plugin, and the module whose `define()` makes its class for the present variant.
 PLUGINS = {
     "layered": "nma.render.layered",
+    "nma": "nma.render.adapter_bsdf",
 }
 
 _registered = False

@@ -1,0 +1,120 @@
+"""Mitsuba 3 BSDF `nma`: an expensive source material as its adapter sees it, a blend of Principled BRDFs.
+
+The network maps source parameters and cos(theta_i) to the blend; value, density and sampling are those of the blend.
+Without textures it runs when the scene is loaded, into curves over cos(theta_i); with textures at every shading point,
+once for all that a path tracer asks there. Inputs: `nma.render.inputs`. One-sided; wrap it in `twosided` if needed.
+
+Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond its training
+range are moved there instead of refused; and the parameters of the adapter's class, or a `material` that has them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nma import target
+from nma.adapter import Adapter, shipped
+from nma.ops import Vec3
+from nma.render.curves import MIN_COS, Curves
+from nma.render.inputs import Inputs
+from nma.render.layered import check_variant
+from nma.target import Blend
+
+DEFAULT_ADAPTER = "layered3-5x64"
+
+
+def define() -> type:
+    """The plugin's class for Mitsuba's present variant."""
+    import mitsuba
+
+    from nma.jit import dr
+
+    mi: Any = mitsuba  # its types change with the variant
+
+    class Nma(mi.BSDF):
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            check_variant(mi.variant(), props.plugin_name())
+            name = props.get("adapter", DEFAULT_ADAPTER)
+            # Weights lie beside the scene, as the files of Mitsuba's own plugins do.
+            self.adapter = Adapter.load(name if name in shipped() else str(mi.file_resolver().resolve(name)))
+            self.inputs = Inputs(self.adapter.space, props, "training", props.get("clamp", False))
+            self._curves = None if self.inputs.textured else Curves(self.adapter, self.inputs.columns())
+            self._warned = False
+            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            if self.inputs.textured:
+                flags |= mi.BSDFFlags.SpatiallyVarying
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            self.inputs.traverse(callback)
+
+        def parameters_changed(self, keys: Any = ()) -> None:
+            self.inputs.check(keys)
+            if not self.inputs.textured:
+                self._curves = Curves(self.adapter, self.inputs.columns())
+
+        def to_string(self) -> str:
+            return f"Nma[\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
+
+        def eval(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            blend, active = self._prepare(ctx, si, active)
+            return _eval_pdf(blend, si, wo, active)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            blend, active = self._prepare(ctx, si, active)
+            return _sample(blend, si, sample1, sample2, active)
+
+        def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
+            blend, active = self._prepare(ctx, si, active)
+            return *_eval_pdf(blend, si, wo, active), *_sample(blend, si, sample1, sample2, active)
+
+        def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
+            """The blend at `si`, and the lanes that see the front."""
+            self._warn_of_light_paths(ctx)
+            active = mi.Bool(active) & (si.wi.z > 0)
+            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+                active = mi.Bool(False)
+            cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
+            if self._curves is not None:
+                return self._curves.at(cos_theta_i, active), active
+            return self.adapter.prepare(self.inputs.columns(si, active), cos_theta_i), active
+
+        def _warn_of_light_paths(self, ctx) -> None:
+            """Says once that light traced from its source makes another picture, where it does."""
+            if self._warned or ctx.mode != mi.TransportMode.Importance or not self.adapter.directional:
+                return
+            self._warned = True
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"BSDF 'nma' {self.id()}: its adapter ({self.adapter.variant}) is not reciprocal, so integrators that "
+                "trace paths from the light converge to another picture than `path`; use `path` or `prb`",
+            )
+
+    def _eval_pdf(blend: Blend, si, wo, active):
+        value, pdf = target.eval_pdf(blend, _vec3(si.wi), _vec3(wo))
+        return mi.Color3f(*value) & active, pdf & active
+
+    def _sample(blend: Blend, si, sample1, sample2, active):
+        wo, value, pdf = target.sample(blend, _vec3(si.wi), sample1, sample2.x, sample2.y)
+        valid = active & (pdf > 0)
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo = mi.Vector3f(*wo)
+        bs.pdf = pdf & valid
+        bs.eta = 1.0
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+        bs.sampled_component = mi.UInt32(0)
+        return bs, (mi.Color3f(*value) / dr.select(valid, pdf, 1.0)) & valid
+
+    return Nma
+
+
+def _vec3(v: Any) -> Vec3:
+    return Vec3(v.x, v.y, v.z)

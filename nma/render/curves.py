@@ -1,0 +1,86 @@
+"""The target of an untextured material as curves over cos(theta_i), so that rendering needs no network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from nma import encoding, network
+from nma.adapter import Adapter
+from nma.jit import dr
+from nma.ops import Float
+from nma.target.blend import Blend
+from nma.target.decode import decode, from_numbers, numbers
+
+# Over draws from the training ranges, values at the blend's own samples differed by 1e-4 on average from those of the
+# network at the same cosine, albedos by 1e-5. Closer nodes at grazing angles changed little.
+NODES = 128
+# Numbers that one gather fetches. Dr.Jit loads powers of two together; 24 numbers took three loads of 8.
+PACKET = 8
+# Cosines below are taken for this one: an adapter need not know what happens at the very horizon.
+MIN_COS = 1e-4
+
+
+class Curves:
+    """The numbers of a blend (`nma.target.numbers`) at fixed cosines, linearly interpolated between them.
+
+    Any mixture of such numbers is a valid blend again. Derivatives reach the parameters that the curves were made from.
+    """
+
+    def __init__(self, adapter: Adapter, columns: Sequence[Float], nodes: int = NODES):
+        """
+        Args:
+            adapter: whose network is evaluated.
+            columns: `mi.Float` of width 1 for each column of the class's parameter vector.
+            nodes: number of cosines; two will do if the target ignores the direction.
+        """
+        import mitsuba as mi
+
+        self.target = adapter.target
+        self.size = adapter.size
+        self.nodes = nodes if adapter.directional else 2
+        cosines = dr.maximum(dr.linspace(mi.Float, 0.0, 1.0, self.nodes), MIN_COS)
+        flat = numbers(_prepare(adapter, columns, cosines), adapter.target)
+
+        # Node by node, filled up to whole packets.
+        self.packets = -(-self.size // PACKET)
+        flat += [0.0] * (self.packets * PACKET - self.size)
+        self.table = _interleaved(flat, self.nodes)
+        dr.eval(self.table)
+
+    def at(self, cos_theta_i: Float, active: Any = True) -> Blend:
+        """The blend at cos(theta_i) in 0..1."""
+        import mitsuba as mi
+
+        position = dr.clip(cos_theta_i, 0.0, 1.0) * (self.nodes - 1)
+        left = dr.minimum(mi.UInt32(position), self.nodes - 2)
+        t = position - mi.Float(left)
+        flat = []
+        for packet in range(self.packets):
+            index = left * self.packets + packet
+            ends = [self._gather(index + step * self.packets, active) for step in (0, 1)]
+            flat += [dr.lerp(a, b, t) for a, b in zip(*ends, strict=True)]
+        return from_numbers(flat[: self.size], self.target)
+
+    def _gather(self, index: Any, active: Any) -> Any:
+        import mitsuba as mi
+
+        return dr.gather(mi.ArrayXf, self.table, index, active, shape=(PACKET, dr.width(index)))
+
+
+def _prepare(adapter: Adapter, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
+    """`Adapter.prepare` by products of matrices: a few small kernels instead of a large one to compile."""
+    import mitsuba as mi
+
+    inputs = encoding.get(adapter.encoding)(columns, cos_theta_i if adapter.directional else None)
+    x = mi.TensorXf(_interleaved(inputs, dr.width(cos_theta_i)), (dr.width(cos_theta_i), len(inputs)))
+    layers = [(mi.TensorXf(matrix), mi.TensorXf(bias)) for matrix, bias in adapter.layers]
+    raw = network.forward(layers, x)
+    return decode([raw[:, k].array for k in range(adapter.size)], adapter.instances, adapter.target)
+
+
+def _interleaved(values: Sequence[Float], width: int) -> Float:
+    """All first entries, then all second ones, ..., of numbers and arrays of that width."""
+    import mitsuba as mi
+
+    return dr.ravel(mi.ArrayXf([mi.Float(value) + dr.zeros(mi.Float, width) for value in values]))
