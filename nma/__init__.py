@@ -12,18 +12,22 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from nma.adapter import Adapter, shipped
-    from nma.dataset import Dataset, Settings
-    from nma.errors import NmaError
-    from nma.evaluate import evaluate as evaluate_adapter
-    from nma.evaluate import tabulate_adapter
-    from nma.image_metrics import compare_images
-    from nma.materials import load as load_material
-    from nma.materials import names as material_names
-    from nma.params import LAYERED3, ParamSpace
-    from nma.render.scene import preview_scene
-    from nma.sources import get as source
-    from nma.table import Tables, tabulate
+    from nma.adapter import Adapter as Adapter
+    from nma.adapter import shipped as shipped
+    from nma.dataset import Dataset as Dataset
+    from nma.dataset import Settings as Settings
+    from nma.errors import NmaError as NmaError
+    from nma.evaluate import evaluate as evaluate_adapter  # noqa: F401
+    from nma.evaluate import tabulate_adapter as tabulate_adapter
+    from nma.image_metrics import compare_images as compare_images
+    from nma.materials import load as load_material  # noqa: F401
+    from nma.materials import names as material_names  # noqa: F401
+    from nma.params import LAYERED3 as LAYERED3
+    from nma.params import ParamSpace as ParamSpace
+    from nma.render.scene import preview_scene as preview_scene
+    from nma.sources import get as source  # noqa: F401
+    from nma.table import Tables as Tables
+    from nma.table import tabulate as tabulate
 
 _HOMES = {
     "Adapter": "nma.adapter",

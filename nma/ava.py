@@ -1,7 +1,8 @@
 """Points inside the bins of an isotropic table, for Average-vs-Average supervision (paper eq. 6) and for evaluation.
 
 A bin of 2e-3 sr is much wider than a sharp lobe, so uniform points miss it. These points are denser towards the mirror
-direction on every scale down to the narrowest lobe, and carry the weights that make the average of any function unbiased.
+direction on every scale down to the narrowest lobe, and carry the weights that make the average of any function
+unbiased.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def noise_floor(b: NDArray, error: NDArray) -> float:
 
 
 def counting_error(b: NDArray, walks: int, solid_angle: float, rows: int) -> NDArray[np.float64]:
-    """Standard error per bin estimated from the number of walks alone, as if every throughput were 1 (an upper bound)."""
+    """Standard error per bin from the number of walks alone, as if every throughput were 1: an upper bound."""
     return np.sqrt(np.maximum(b, 0.0).astype(np.float64) * rows / (walks * solid_angle))
 
 

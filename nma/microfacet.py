@@ -1,7 +1,8 @@
 """GGX microfacets and Fresnel reflectance, shared by the sources and by the target (CONVENTIONS.md).
 
 Directions are `Vec3` in the local frame, z up, pointing away from the surface. `alpha` is the microfacet width; the
-anisotropic forms take one width along x and one along y. Nothing here branches: all functions run on Dr.Jit, JAX and NumPy.
+anisotropic forms take one width along x and one along y. Nothing here branches: all functions run on Dr.Jit, JAX and
+NumPy.
 """
 
 from __future__ import annotations
