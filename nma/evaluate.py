@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,86 +9,184 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ava, metrics, target
+from nma import ava, metrics, ops, target
 from nma.adapter import Adapter
-from nma.errors import TableError
+from nma.errors import ParamError, TableError
 from nma.jit import dr
-from nma.ops import Color
-from nma.table import ISOTROPIC, Grid, Tables
+from nma.ops import Vec3
+from nma.table import ISOTROPIC, Grid, Tables, bin_index
 
-# The network runs at this many cos(theta_i) in each row of the table ...
+# The network runs at this many cos(theta_i) in each row of the table. For each of them the target is evaluated at this
+# many wo in each bin, and at this many wo drawn from its own lobes.
 _DIRECTIONS = 32
-# ... and the target at this many wo in each bin for each of them.
 _POINTS = 4
+_SAMPLES = 512
+# Where the target's density far exceeds this [1/sr], its lobes are too sharp for points in a bin: its samples count.
+_SHARP = 10.0
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures per material and their means; `integration_error` is the log loss between two estimates of the adapter's
-    own bin averages, `estimated_error` whether the references came without standard errors."""
+    """Figures per material and their means.
+
+    `integration_error` and `albedo_integration_error` say how exact the adapter's own bin averages are, in log loss and
+    in albedo, from two independent estimates; `estimated_error` whether the references came without standard errors.
+    """
 
     materials: list[dict[str, float]]
     mean: dict[str, float]
     integration_error: float
+    albedo_integration_error: float
     estimated_error: bool
 
 
-def tabulate_adapter(adapter: Adapter, params: NDArray, *, shift: float = 0.0, grid: Grid = ISOTROPIC) -> NDArray[np.float32]:
-    """The adapter's bin averages (n, theta_i, theta_o, phi, 3). `shift` in [0, 1) selects another set of points."""
-    params = adapter.space.check(params, "training", clamp=True) if adapter.encoding != "direction" else params
+def tabulate_adapter(
+    adapter: Adapter, params: NDArray, *, shift: float = 0.0, clamp: bool = False, grid: Grid = ISOTROPIC
+) -> NDArray[np.float32]:
+    """The adapter's bin averages (n, theta_i, theta_o, phi, 3). `shift` in [0, 1) selects another set of points.
+
+    Raises `ParamError` for parameters outside of the training range, or moves them to it with `clamp`.
+    """
+    params = _known(adapter, params, clamp)
     strata = np.arange(grid.theta_i * _DIRECTIONS)
     jitter = (strata * 0.6180339887 + 0.31 + shift) % 1.0
     mu = ((strata + jitter) / len(strata)).astype(np.float32)
     return np.stack([_tabulate(adapter.numbers(p[None], mu)[0], mu, shift, adapter, grid) for p in params])
 
 
-def _tabulate(numbers: NDArray, mu: NDArray, shift: float, adapter: Adapter, grid: Grid) -> NDArray[np.float32]:
-    """One material's table from its target parameters (theta_i * directions, size) at the cosines `mu`."""
+def _known(adapter: Adapter, params: NDArray, clamp: bool) -> NDArray[np.float64]:
+    """The parameters, if the adapter was trained for such."""
+    if adapter.encoding != "direction":
+        return adapter.space.check(params, "training", clamp)
+    params, fitted = adapter.space.check(params), adapter.training.get("params")
+    if fitted is not None and not np.allclose(params, fitted, rtol=1e-5):
+        known = adapter.training.get("material", "the one it was fitted to")
+        raise ParamError(f"the adapter knows a single material, {known}; the parameters are those of another")
+    return params
+
+
+def _tabulate(
+    numbers: NDArray, mu: NDArray, shift: float, adapter: Adapter, grid: Grid
+) -> NDArray[np.float32]:
+    """One material's table from its target parameters (theta_i * directions, size) at the cosines `mu`.
+
+    f cos(theta_o) is split by a smooth function of its own density into a sharp part, which the target's samples find
+    whatever its width, and the rest, which points in every bin resolve.
+    """
+    curves = [dr.auto.Float(np.ascontiguousarray(c)) for c in numbers.T]
+    cosines, seed = dr.auto.Float(mu), dr.opaque(dr.auto.UInt32, int(shift * 2**24))
+    table = _by_points(curves, cosines, seed, adapter, grid) + _by_samples(
+        curves, cosines, seed, adapter, grid
+    )
+    return table.reshape(grid.shape).astype(np.float32)
+
+
+def _by_points(
+    curves: list[Any], cosines: Any, seed: Any, adapter: Adapter, grid: Grid
+) -> NDArray[np.float64]:
+    """The part that is not sharp (bins, 3), averaged over points in every bin."""
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     bins = dr.arange(UInt32, grid.bins)
     row = bins // (grid.theta_o * grid.phi_o)
     o = Float((bins // grid.phi_o) % grid.theta_o)
     p = Float(bins % grid.phi_o)
-    curves = [Float(np.ascontiguousarray(c)) for c in numbers.T]
-    cosines = Float(mu)
-    lattice = ava.lattice(_DIRECTIONS * _POINTS) + shift * np.array([0.31, 0.57, 0.83])
-    lattice_u = Float((lattice[:, 0] % 1.0).astype(np.float32))
-    lattice_v = Float((lattice[:, 1] % 1.0).astype(np.float32))
+    shifts = [_uniform(bins * 2 + k, seed) for k in range(2)]
+    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(_DIRECTIONS * _POINTS).T[:2]]
 
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
         at = row * _DIRECTIONS + k // _POINTS
         blend = target.from_numbers([dr.gather(Float, c, at) for c in curves], adapter.target)
-        u = dr.gather(Float, lattice_u, k), dr.gather(Float, lattice_v, k)
-        points = ava.bin_points_at(dr.gather(Float, cosines, at), o, p, u, grid)
-        value = target.eval(blend, points.wi, points.wo) * points.weight
+        u, v = (_shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
+        across = dr.gather(Float, cosines, at) * grid.theta_i - Float(row)
+        points = ava.uniform_bin_points(Float(row), o, p, (across, u, v), grid)
+        value, pdf = target.eval_pdf(blend, points.wi, points.wo)
+        value = value * (1.0 - _sharpness(pdf))
         return k + 1, red + value.x, green + value.y, blue + value.z
 
     zero = dr.zeros(Float, grid.bins)
     state = (dr.zeros(UInt32, grid.bins), zero, zero, zero)
-    sums = dr.while_loop(state, lambda k, *_: k < _DIRECTIONS * _POINTS, body, mode="symbolic", label="bin averages")[1:]
-    table = np.stack([s.numpy() for s in Color(*sums)], axis=-1) / (_DIRECTIONS * _POINTS)
-    return table.reshape(grid.shape)
+    sums = dr.while_loop(
+        state, lambda k, *_: k < _DIRECTIONS * _POINTS, body, mode="symbolic", label="bin averages"
+    )[1:]
+    return np.stack([s.numpy() for s in sums], axis=-1) / float(_DIRECTIONS * _POINTS)
 
 
-def evaluate(adapter: Adapter, reference: Tables, progress: Callable[[int], None] = lambda done: None) -> Evaluation:
-    """Compares the adapter with reference tables over the paper's bins."""
+def _by_samples(
+    curves: list[Any], cosines: Any, seed: Any, adapter: Adapter, grid: Grid
+) -> NDArray[np.float64]:
+    """The sharp part (bins, 3), from samples of the target's own lobes."""
+    Float, UInt32 = dr.auto.Float, dr.auto.UInt32
+    lane = dr.arange(UInt32, len(cosines) * _SAMPLES)
+    at, k = lane // _SAMPLES, lane % _SAMPLES
+    blend = target.from_numbers([dr.gather(Float, c, at) for c in curves], adapter.target)
+    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(_SAMPLES).T]
+    u = [_shifted(dr.gather(Float, x, k), _uniform(at * 3 + n, ~seed)) for n, x in enumerate(lattice)]
+    mu = dr.gather(Float, cosines, at)
+    wo, value, pdf = target.sample(blend, Vec3(ops.safe_sqrt(1.0 - mu * mu), 0.0 * mu, mu), *u)
+    value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
+    index = bin_index(at // _DIRECTIONS, UInt32(0), wo, grid)
+    dr.eval(index, value)
+    # Summed by NumPy, in a fixed order.
+    sums = [np.bincount(index.numpy(), c.numpy(), grid.bins) for c in value]
+    return np.stack(sums, axis=-1) / (_DIRECTIONS * _SAMPLES * grid.solid_angle)
+
+
+def _sharpness(pdf: Any) -> Any:
+    """Share of a value that belongs to the sharp part, 0 to 1, given its density."""
+    x = pdf * (1.0 / _SHARP)
+    return 1.0 - 1.0 / (1.0 + x * x)
+
+
+def _shifted(x: Any, shift: Any) -> Any:
+    """x + shift modulo 1."""
+    x = x + shift
+    return x - dr.floor(x)
+
+
+def _uniform(number: Any, seed: Any) -> Any:
+    """A fixed random number in [0, 1) for each `number`. Jarzynski and Olano 2020, "pcg"."""
+    state = (number ^ (seed * 0x9E3779B9)) * 747796405 + 2891336453
+    word = ((state >> ((state >> 28) + 4)) ^ state) * 277803737
+    return dr.auto.Float(((word >> 22) ^ word) >> 8) * (1.0 / 2**24)
+
+
+def evaluate(
+    adapter: Adapter,
+    reference: Tables,
+    progress: Callable[[int], None] = lambda done: None,
+    *,
+    clamp: bool = False,
+) -> Evaluation:
+    """Compares the adapter with reference tables over the paper's bins.
+
+    Raises `TableError` for tables of other bins, and `ParamError` for materials that the adapter was not trained for,
+    unless `clamp` moves their parameters to the training range.
+    """
     if reference.values.shape[1:] != ISOTROPIC.shape:
-        raise TableError(f"evaluation wants isotropic tables {ISOTROPIC.shape}, the reference has {reference.values.shape[1:]}")
-    materials, integration = [], []
-    for n, params in enumerate(reference.params):
-        halves = [tabulate_adapter(adapter, params[None], shift=s)[0] for s in (0.0, 0.5)]
-        b = reference.values[n]
-        error = _error(reference, n)
-        materials.append(metrics.table_metrics(0.5 * (halves[0] + halves[1]), b, error))
-        # Each half has twice the variance of their mean.
-        integration.append(np.mean(np.abs(np.log1p(halves[0]) - np.log1p(halves[1]))) / 2.0)
+        raise TableError(
+            f"evaluation wants isotropic tables {ISOTROPIC.shape}, the reference has {reference.values.shape[1:]}"
+        )
+    if not len(reference.params):
+        raise TableError("the reference holds no material")
+    params = _known(adapter, reference.params, clamp)
+    materials, spreads = [], []
+    for n in range(len(params)):
+        halves = [tabulate_adapter(adapter, params[n : n + 1], shift=s)[0] for s in (0.0, 0.5)]
+        mean = 0.5 * (halves[0] + halves[1])
+        materials.append(metrics.table_metrics(mean, reference.values[n], _error(reference, n)))
+        spread = metrics.table_metrics(halves[0], halves[1], np.zeros_like(mean))
+        # The mean of two estimates is off by half of their difference, on average.
+        spreads.append((0.5 * spread["log_loss"], 0.5 * spread["albedo_error"]))
         progress(n + 1)
-    return Evaluation(materials, metrics.mean_metrics(materials), float(np.mean(integration)), reference.error is None)
+    log_loss, albedo = np.mean(spreads, axis=0)
+    return Evaluation(
+        materials, metrics.mean_metrics(materials), float(log_loss), float(albedo), reference.error is None
+    )
 
 
 def _error(reference: Tables, n: int) -> NDArray:
+    """Standard error per bin of a reference, from counting statistics if it does not state any."""
     if reference.error is not None:
         return reference.error[n]
-    return metrics.counting_error(
-        reference.values[n], int(reference.walks[n]), 2.0 * math.pi / (ISOTROPIC.theta_o * ISOTROPIC.phi_o), ISOTROPIC.theta_i
-    )
+    walks = int(reference.walks[n])
+    return metrics.counting_error(reference.values[n], walks, ISOTROPIC.solid_angle, ISOTROPIC.rows)

@@ -26,8 +26,8 @@ from nma.sources.base import Source, Walk
 
 # Throughputs are counted as integers in units of 2^-16: integer sums do not depend on the order of the additions.
 _UNIT = 65536.0
-# So many walks of one row fit one 32-bit bin, all of them with throughput 1.
-_WALKS_PER_ROW = 65535
+# So many walks of one row fit one 32-bit bin, all of them with throughput 1, and leave room for some above 1.
+_WALKS_PER_ROW = 49151
 # Bins that one launch counts in, over all of its materials: bounds the memory, has no influence on the result.
 _BINS_PER_LAUNCH = 1 << 21
 
@@ -271,7 +271,7 @@ def _sweep(
         state = begin(state, ~state.walk.alive)
         walk = source.step(params, state.walk, state.rng)
         over = ~walk.alive
-        index = (offset + _bin(state.row, phi_row, Vec3(*walk.direction), grid)) * 3
+        index = (offset + bin_index(state.row, phi_row, Vec3(*walk.direction), grid)) * 3
         for channel, value in enumerate(walk.throughput):
             counted = over & (value > 0)
             for counter, moment in zip(counters, (value, value * value), strict=False):
@@ -285,8 +285,8 @@ def _sweep(
     dr.while_loop((state,), lambda s: s.row < grid.theta_i, body, mode="symbolic", label="walks")
 
 
-def _bin(row: Any, phi_row: Any, wo: Vec3, grid: Grid) -> Any:
-    """Index of the bin of (row, wo) in a flattened table."""
+def bin_index(row: Any, phi_row: Any, wo: Vec3, grid: Grid) -> Any:
+    """Index in a flattened table of the bin of wo, for wi in the bins `row` of theta_i and `phi_row` of phi_i."""
     UInt32 = dr.auto.UInt32
     o = dr.minimum(UInt32(dr.maximum(wo.z, 0.0) * grid.theta_o), grid.theta_o - 1)
     phi = ops.atan2(wo.y, wo.x)

@@ -146,11 +146,14 @@ def evaluate(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
     ] = False,
+    clamp: Annotated[
+        bool, typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range.")
+    ] = False,
 ) -> None:
     """Compare an adapter with reference tables over the paper's bins: means over bins and RGB, then over materials.
 
-    The adapter's own bin averages are integrated with points crowded where lobes are narrow; the table's last line
-    says how exact they are. See docs/evaluation.md for every figure's formula.
+    The adapter's own bin averages are integrated with points in every bin and samples of its narrow lobes; the line
+    below the table says how exact they are. See docs/evaluation.md for every figure's formula.
     """
     from nma.adapter import Adapter
     from nma.evaluate import evaluate as run
@@ -166,7 +169,7 @@ def evaluate(
         def progress(done: int) -> None:
             bar.update(task, completed=done, rate=f"{done / (time.perf_counter() - began):.2f}")
 
-        result = run(adapter, tables, progress)
+        result = run(adapter, tables, progress, clamp=clamp)
     if as_json:
         print(json.dumps({"mean": result.mean, "materials": result.materials}))
         return
@@ -175,7 +178,10 @@ def evaluate(
     console.out.print(
         console.table(("material", *FIGURES), rows, f"{weights} ({adapter.variant}) against {reference}")
     )
-    console.out.print(f"The adapter's bin averages are exact to {result.integration_error:.1e} in log loss.")
+    console.out.print(
+        f"The adapter's bin averages are exact to {result.integration_error:.1e} in log loss, "
+        f"its albedos to {result.albedo_integration_error:.1e}."
+    )
     if result.estimated_error:
         console.out.print(
             "The reference has no standard errors; its noise floor is an upper bound from counting walks."
