@@ -1,0 +1,217 @@
+"""Time, variance and error of `principled`, `layered` and `nma` in the preview scene, without textures and with three.
+
+    python bench/render.py [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--output out/bench]
+
+Frames of all BSDFs take turns, so that other load on the machine meets all of them; `load` is its average at start
+and end. `time` is the median wall time of a frame and `cpu` the median of its processor seconds, both after a first
+frame; `first` is what that frame took beyond the median: compilation, or little where Dr.Jit has the kernels on
+disk. The ratios are medians over rounds of a frame's time to that of `principled` in the same round. `variance` is
+that of one frame, mean over pixels and channels, from independent seeds; `efficiency` 1 / (variance x time). `bias`
+is the root mean square of (mean of the frames - converged `layered`), less the noise of both; `smape` that of the
+same two pictures with their noise, so the line of `layered` shows how much of it is noise. `principled` is a stand-
+in for its time and noise; it shows another material.
+
+Writes render.json and render.png: the expected error after a time, from the variance and the bias.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from machine import header
+from numpy.typing import NDArray
+
+import nma.render
+from nma import materials
+from nma.adapter import shipped
+from nma.image_metrics import errors
+from nma.render.load import load_dict, material_bsdf
+from nma.render.measure import render_seconds
+from nma.render.progressive import render_passes
+from nma.render.scene import bitmap_texture, material_coverage, preview_scene
+from nma.render.textures import procedural_textures
+
+DEPTH = 6
+ADAPTERS = ("layered3-5x64", "layered3-3x32")
+COLUMNS = "  ".join(
+    (
+        f"{'scene':9} {'bsdf':19} {'time s':>7} {'ratio':>6} {'cpu s':>6} {'ratio':>6} {'first s':>8}",
+        f"{'variance':>9} {'efficiency':>10} {'bias':>8} {'smape':>7}",
+    )
+)
+Array = NDArray[np.float64]
+
+
+class Frames(NamedTuple):
+    """Everything about one BSDF in one of the scenes: pictures (runs, height, width, 3) and seconds (runs,)."""
+
+    pictures: Array
+    wall: Array
+    cpu: Array
+    first: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--reference-spp", type=int, default=1024)
+    parser.add_argument("--adapter", nargs="*", default=ADAPTERS, help="shipped names or weights files")
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--output", type=Path, default=Path("out/bench"))
+    options = parser.parse_args()
+    nma.render.use(options.variant)
+    size = (options.size, options.size)
+    coverage = material_coverage(size)
+    print(header())
+    print(
+        f"frames   {options.size} x {options.size}, {options.spp} spp, path depth {DEPTH}, material on {coverage:.0%} "
+        f"of the pixels, {options.variant}; {options.runs} runs, reference {options.reference_spp} spp\n\n{COLUMNS}"
+    )
+    rows = []
+    for scene, bsdfs in scenes(options.adapter).items():
+        loaded = {
+            name: load_dict(preview_scene(bsdf, size=size, max_depth=DEPTH)) for name, bsdf in bsdfs.items()
+        }
+        frames = measure_in_turns(loaded, options.spp, options.runs)
+        truth = render_passes(loaded["layered"], options.reference_spp, seed=12345).astype(np.float64)
+        share = options.spp / options.reference_spp
+        for name in bsdfs:
+            rows.append(row(scene, name, frames, truth, share))
+            print(line(rows[-1]), flush=True)
+    print("\nload     {:.2f} {:.2f} {:.2f} at the end".format(*os.getloadavg()))
+    options.output.mkdir(parents=True, exist_ok=True)
+    record = {
+        "machine": header(),
+        "settings": {k: v for k, v in vars(options).items() if k != "output"},
+        "coverage": coverage,
+        "rows": rows,
+    }
+    (options.output / "render.json").write_text(json.dumps(record, indent=1))
+    plot(rows, options.output / "render.png")
+    print(f"wrote    {options.output}/render.json, {options.output}/render.png")
+
+
+def scenes(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """For each scene, the BSDFs by name; `layered` and `nma` show the same material, `principled` costs the like."""
+    for name in adapters:
+        if name not in shipped() and not Path(name).is_file():
+            raise SystemExit(f"there is no adapter {name}; shipped are {', '.join(shipped())}")
+    gold = materials.load("gold-red-lacquer")
+    worn = materials.load("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
+    images = {name: bitmap_texture(t, scale=2.0) for name, t in procedural_textures(512).items()}
+    red = {"type": "rgb", "value": [0.8, 0.2, 0.1]}
+    plain: dict[str, Any] = {"type": "principled", "metallic": 0.5, "roughness": 0.35, "clearcoat": 0.5}
+    names = {"base_color": "albedo", "roughness": "alpha_bottom", "metallic": "sigma_t"}
+    textured = plain | {theirs: images[ours] for theirs, ours in names.items()}
+    return {
+        "plain": {
+            "principled": plain | {"base_color": red},
+            "layered": material_bsdf(gold, "layered"),
+            "nma": material_bsdf(gold, adapter=adapters[0]),
+        },
+        "textured": {
+            "principled": textured,
+            "layered": material_bsdf(worn, "layered") | images,
+            **{f"nma {Path(name).stem}": material_bsdf(worn, adapter=name) | images for name in adapters},
+        },
+    }
+
+
+def measure_in_turns(loaded: dict[str, Any], spp: int, runs: int) -> dict[str, Frames]:
+    """A first frame of every scene, then one frame of each, again and again with other seeds."""
+    first = {name: render_seconds(scene, spp, runs)[1] for name, scene in loaded.items()}
+    pictures: dict[str, list[Array]] = {name: [] for name in loaded}
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in loaded}
+    for seed in range(runs):
+        for name, scene in loaded.items():
+            before = processor_seconds()
+            picture, wall = render_seconds(scene, spp, seed)
+            seconds[name].append((wall, processor_seconds() - before))
+            pictures[name].append(picture)
+    clocks = {name: np.array(s).T for name, s in seconds.items()}
+    return {
+        name: Frames(np.array(pictures[name]), wall, cpu, max(first[name] - float(np.median(wall)), 0.0))
+        for name, (wall, cpu) in clocks.items()
+    }
+
+
+def processor_seconds() -> float:
+    """Of all threads of this process."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def row(scene: str, name: str, frames: dict[str, Frames], truth: Array, share: float) -> dict[str, Any]:
+    """The figures of one BSDF; `share` is the samples of a frame over those of the reference `truth`."""
+    own, principled = frames[name], frames["principled"]
+    variance, wall = float(own.pictures.var(axis=0, ddof=1).mean()), float(np.median(own.wall))
+    figures: dict[str, Any] = {
+        "scene": scene,
+        "bsdf": name,
+        "seconds": wall,
+        "seconds_ratio": float(np.median(own.wall / principled.wall)),
+        "cpu": float(np.median(own.cpu)),
+        "cpu_ratio": float(np.median(own.cpu / principled.cpu)),
+        "first": own.first,
+        "variance": variance,
+        "efficiency": 1.0 / (variance * wall),
+        "all_seconds": own.wall.tolist(),
+        "all_cpu": own.cpu.tolist(),
+    }
+    if name == "principled":
+        return figures
+    mean = own.pictures.mean(axis=0)
+    noise = variance / len(own.pictures)
+    noise += share * float(frames["layered"].pictures.var(axis=0, ddof=1).mean())
+    squared = float(((mean - truth) ** 2).mean()) - noise
+    # The reference has no bias; what its noise leaves of the difference is no finding.
+    figures["bias"] = 0.0 if name == "layered" else float(np.sqrt(max(squared, 0.0)))
+    figures["smape"] = errors(mean, truth)["smape"]
+    return figures
+
+
+def line(row: dict[str, Any]) -> str:
+    """One line of the table."""
+    text = (
+        f"{row['scene']:9} {row['bsdf']:19} {row['seconds']:7.2f} {row['seconds_ratio']:6.2f} {row['cpu']:6.2f} "
+        f"{row['cpu_ratio']:6.2f} {row['first']:8.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"
+    )
+    return text + (f" {row['bias']:8.4f} {row['smape']:7.4f}" if "bias" in row else f" {'-':>8} {'-':>7}")
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Root mean square error against rendering time, one panel for each scene."""
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    figure, panels = plt.subplots(
+        1, len(names), figsize=(5.0 * len(names), 3.8), sharey=True, layout="constrained"
+    )
+    for panel, scene in zip(panels, names, strict=True):
+        for row in rows:
+            if row["scene"] != scene or "bias" not in row:
+                continue
+            seconds = row["seconds"] * np.geomspace(0.1, 1000.0, 100)
+            error = np.sqrt(row["bias"] ** 2 + row["variance"] * row["seconds"] / seconds)
+            panel.loglog(seconds, error, label=row["bsdf"])
+        panel.set(title=f"{scene} material", xlabel="rendering time [s]")
+        panel.grid(alpha=0.3)
+        panel.legend()
+    panels[0].set_ylabel("expected RMS error of the picture")
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == "__main__":
+    main()
