@@ -166,8 +166,8 @@ def demo(
     adapter: _AdapterName = "layered3-5x64",
     size: _Size = "256",
     spp: Annotated[int, typer.Option(help="Samples per pixel of the frames that are timed.")] = 64,
-    runs: Annotated[int, typer.Option(help="Frames of each kind, with seeds of their own.")] = 4,
-    reference_spp: Annotated[int, typer.Option(help="Samples per pixel of the converged reference.")] = 1024,
+    runs: Annotated[int, typer.Option(help="Frames of each kind, with seeds of their own.")] = 3,
+    reference_spp: Annotated[int, typer.Option(help="Samples per pixel of the converged reference.")] = 768,
     variant: _Variant = "auto",
 ) -> None:
     """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.

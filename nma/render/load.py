@@ -9,10 +9,10 @@ from typing import Any
 
 from nma.errors import NmaError, ParamError
 from nma.materials import Material, Texture
+from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.scene import bitmap_texture
 
 MODELS = ("nma", "layered")
-DEFAULT_ADAPTER = "layered3-5x64"
 
 
 class SceneError(NmaError, RuntimeError):

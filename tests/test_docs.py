@@ -1,0 +1,34 @@
+"""The pages about rendering do what they say: their Python runs."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nma import encoding, network
+from nma.adapter import Adapter
+from nma.params import LAYERED3
+from nma.target import PRINCIPLED_PARAMS
+from nma.target.decode import output_size
+
+import nma.render  # noqa: F401  # isort: skip
+import mitsuba as mi  # isort: skip
+
+PAGE = Path(__file__).parents[1] / "docs" / "mitsuba.md"
+BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S)
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_python_of_the_page_on_mitsuba_runs(number, tmp_path, monkeypatch):
+    """With a tiny network in place of the shipped one, one sample per pixel and few steps, to save time."""
+    inputs = encoding.size("layered3", LAYERED3, True)
+    layers = network.init(np.random.default_rng(0), [inputs, 8, 8, output_size(2, PRINCIPLED_PARAMS)])
+    adapter = Adapter(LAYERED3, "layered3", layers, 2, True, PRINCIPLED_PARAMS)
+    render = mi.render
+    monkeypatch.setattr(Adapter, "load", staticmethod(lambda name: adapter))
+    monkeypatch.setattr(mi, "render", lambda *args, **kwargs: render(*args, **kwargs | {"spp": 1}))
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(BLOCKS[number].replace("range(30)", "range(2)"), names)
+    assert np.isfinite(np.array(names["image"])).all()
