@@ -157,7 +157,7 @@ def resume(recipe: Recipe, layers: Layers, path: Path) -> Run:
     if not path.exists():
         return run
     try:
-        with np.load(path) as f:
+        with path.open("rb") as file, np.load(file) as f:
             notes = json.loads(str(f["notes"]))
             leaves = [f[f"leaf{k}"] for k in range(len(jax.tree.leaves(run.state)))]
             losses, log_losses = f["losses"].tolist(), f["log_losses"].tolist()

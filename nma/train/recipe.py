@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from nma.errors import NmaError
 
@@ -47,6 +47,9 @@ class Recipe:
         for name in positive:
             if not getattr(self, name) > 0:
                 raise NmaError(f"{name} must be positive, got {getattr(self, name)}")
+        for name, hint in get_type_hints(Recipe).items():
+            if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
+                raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
         if not 0 <= self.average < 1:
             raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
 
