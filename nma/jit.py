@@ -1,8 +1,8 @@
 """Dr.Jit, loaded with a libLLVM that it survives: modules of this package take `dr` from here.
 
 Dr.Jit chooses its libLLVM when it is first imported, and an old one kills the process at the first kernel. So the
-choice stands here, before that import. Without a usable libLLVM importing this module raises `MissingDependencyError`, unless
-Dr.Jit computes on a GPU.
+choice stands here, before that import. Without a usable libLLVM importing this module raises
+`MissingDependencyError`, unless Dr.Jit computes on a GPU.
 """
 
 import ctypes

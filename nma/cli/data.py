@@ -27,8 +27,8 @@ def materials(
     from nma import materials as library
 
     if name is None:
-        rows = [(m.name, m.title, m.description) for m in map(library.load, library.names())]
-        console.out.print(console.table(("name", "title", "description"), rows))
+        listed = [(m.name, m.title, m.description) for m in map(library.load, library.names())]
+        console.out.print(console.table(("name", "title", "description"), listed))
         return
     material = library.load(name)
     rows = [
@@ -99,7 +99,7 @@ def dataset(
     walks: Annotated[int, typer.Option(help="Random walks per material.")] = 819_200,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal datasets.")] = 0,
     population: Annotated[
-        str, typer.Option(help="mixed, range, metals, held_out_metals or unseen_metals.")
+        str, typer.Option(help="mixed, range, metals or held_out_metals.")
     ] = "mixed",
 ) -> None:
     """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""

@@ -242,7 +242,7 @@ class _TrainingBar:
         self._task = self._bar.add_task("training", total=self._recipe.steps, rate="", note="")
         return self
 
-    def __exit__(self, *args: object) -> None:
+    def __exit__(self, *args: Any) -> None:
         self._bar.__exit__(*args)
 
     def update(self, run: Any) -> None:

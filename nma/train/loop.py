@@ -143,7 +143,7 @@ def _plateau(run: Run) -> float:
 def save(run: Run, recipe: Recipe, path: Path) -> None:
     """Writes a checkpoint, atomically."""
     leaves = jax.tree.leaves(run.state)
-    arrays = {f"leaf{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+    arrays: dict[str, Any] = {f"leaf{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
     notes = {"recipe": asdict(recipe), "step": run.step, "seconds": run.seconds, "scale": run.scale}
     partial_path = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with partial_path.open("wb") as f:

@@ -17,8 +17,8 @@ _TOLERANCE = 0.003
 def bin_means(layers: Layers, batch: Batch, recipe: Recipe) -> jax.Array:
     """The target's mean over each bin, (3, bins_per_row, rows), for one pass of the network per row."""
     inputs = encoding.get(recipe.encoding)(list(batch.columns), batch.mu if recipe.directional else None)
-    inputs = jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1)
-    raw = network.forward(layers, inputs)
+    stacked = jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1)
+    raw = network.forward(layers, stacked)
     points = _points(batch, recipe)
     value = target.eval(target.decode(list(raw.T), recipe.instances), points.wi, points.wo)
     return jnp.stack([(c * points.weight).mean(axis=0) for c in value])
@@ -27,8 +27,8 @@ def bin_means(layers: Layers, batch: Batch, recipe: Recipe) -> jax.Array:
 def _points(batch: Batch, recipe: Recipe) -> ava.Points:
     """Points (points, bins_per_row, rows) of every bin."""
     if recipe.points_law == "centre":
-        u = (0.5 + 0.0 * batch.shift)[:, None]
-        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(u))
+        middle = (0.5 + 0.0 * batch.shift)[:, None]
+        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(middle))
     lattice = jnp.asarray(ava.lattice(recipe.points), jnp.float32).T[:, :, None, None]
     u = (lattice + batch.shift[:, None]) % 1.0
     place = ava.bin_points if recipe.points_law == "crowded" else ava.uniform_bin_points
