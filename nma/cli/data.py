@@ -98,9 +98,7 @@ def dataset(
     materials: Annotated[int, typer.Option(help="Number of materials.")] = 8000,
     walks: Annotated[int, typer.Option(help="Random walks per material.")] = 819_200,
     seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal datasets.")] = 0,
-    population: Annotated[
-        str, typer.Option(help="mixed, range, metals or held_out_metals.")
-    ] = "mixed",
+    population: Annotated[str, typer.Option(help="mixed, range, metals or held_out_metals.")] = "mixed",
 ) -> None:
     """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
     from nma.dataset import Dataset, Settings

@@ -147,7 +147,8 @@ def evaluate(
         bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
     ] = False,
     clamp: Annotated[
-        bool, typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range.")
+        bool,
+        typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range."),
     ] = False,
 ) -> None:
     """Compare an adapter with reference tables over the paper's bins: means over bins and RGB, then over materials.
