@@ -1,0 +1,169 @@
+"""Derivatives of pictures by the source parameters of `nma`: against finite differences, and fit to find a texture."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_weights import random_adapter
+
+import nma.render
+from nma.jit import dr
+from nma.render.scene import bitmap_texture
+
+nma.render.use("llvm_ad_rgb")
+
+
+def rgb(*values):
+    return {"type": "rgb", "value": list(values)}
+
+
+def grains(channels, seed=0):
+    return np.random.default_rng(seed).uniform(0.3, 0.8, (3, 4, channels))
+
+
+MATERIAL = {
+    "type": "nma",
+    "adapter": "layered3-3x32",
+    "alpha_top": 0.2,
+    "alpha_bottom": 0.4,
+    "eta_top": 1.5,
+    "eta_conductor": rgb(0.2, 0.92, 1.1),
+    "k_conductor": rgb(3.9, 2.45, 2.14),
+    "albedo": rgb(0.8, 0.4, 0.3),
+    "sigma_t": 0.7,
+}
+# A material, and its parameters with a direction in which each moves.
+CASES = {
+    "plain": (
+        MATERIAL,
+        {
+            "sigma_t": np.ones(1),
+            "alpha_bottom": np.ones(1),
+            "albedo": np.array([0.2, 1.0, -0.6]),
+            "eta_conductor": np.array([0.3, 1.0, -0.5]),
+        },
+    ),
+    "textured": (
+        MATERIAL | {"albedo": bitmap_texture(grains(3)), "sigma_t": bitmap_texture(grains(1))},
+        {"sigma_t.data": grains(1, seed=1), "albedo.data": grains(3, seed=1), "eta_top": np.ones(1)},
+    ),
+}
+
+
+def scene(bsdf, depth, sky):
+    """A ball on a floor of the same material under a point light, and a uniform sky of that radiance."""
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}}
+    look = mi.ScalarTransform4f().look_at([0.0, -3.0, 2.5], [0.0, 0.0, 0.4], [0.0, 0.0, 1.0])
+    same = {"type": "ref", "id": "material"}
+    description = {
+        "type": "scene",
+        "integrator": {"type": "prb", "max_depth": depth},
+        "sensor": {"type": "perspective", "fov": 35, "to_world": look, "film": film},
+        "lamp": {"type": "point", "position": [1.5, -2.0, 3.0], "intensity": 10.0},
+        "material": bsdf,
+        "floor": {"type": "rectangle", "bsdf": same},
+        "ball": {"type": "sphere", "center": [0.0, 0.0, 0.5], "radius": 0.5, "bsdf": same},
+    }
+    if sky:
+        description["sky"] = {"type": "constant", "radiance": sky}
+    return mi.load_dict(description)
+
+
+def replaced(params, key, value):
+    """Sets a parameter to these numbers, in the type that it has, and the derivative by it to zero."""
+    kind = type(params[key])
+    numbers = np.asarray(value, np.float32)
+    params[key] = kind(numbers) if kind is mi.TensorXf else kind(numbers.ravel().tolist())
+    dr.enable_grad(params[key])
+
+
+def slopes(loaded, directions, step, spp, seeds):
+    """Derivatives of a picture's mean along each direction, by `prb` and by central differences: one for each seed."""
+    params = mi.traverse(loaded)
+    start = {key: np.array(params[key], np.float64).reshape(d.shape) for key, d in directions.items()}
+    derivatives = {key: [] for key in directions}
+    for seed in range(1, seeds + 1):
+        for key, value in start.items():
+            replaced(params, key, value)
+        params.update()
+        # The pass for derivatives draws its own numbers, here those of the pictures below.
+        picture = mi.render(loaded, params, spp=spp, seed=seeds + seed, seed_grad=seed)
+        dr.backward(dr.mean(picture, axis=None))
+        for key, d in directions.items():
+            derivatives[key].append((np.array(dr.grad(params[key])).reshape(d.shape) * d).sum())
+
+    def mean(key, value, seed):
+        replaced(params, key, value)
+        params.update()
+        with dr.suspend_grad():
+            return np.array(mi.render(loaded, spp=spp, seed=seed), np.float64).mean()
+
+    differences = {}
+    for key, d in directions.items():
+        up, down = ([mean(key, start[key] + s * d, n + 1) for n in range(seeds)] for s in (step, -step))
+        differences[key] = (np.array(up) - np.array(down)) / (2.0 * step)
+        mean(key, start[key], 1)
+    return {key: np.array(value) for key, value in derivatives.items()}, differences
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
+    """With one point light nothing is random but the place in the pixel, the same on all sides."""
+    bsdf, directions = CASES[name]
+    if name == "textured":
+        # Any weights will do, and small ones compile fast.
+        random_adapter(hidden="2x8").save(tmp_path / "small.safetensors")
+        bsdf = bsdf | {"adapter": str(tmp_path / "small.safetensors")}
+    directions = {f"material.{key}": d for key, d in directions.items()}
+    derivatives, differences = slopes(scene(bsdf, depth=2, sky=0.0), directions, 0.002, spp=16, seeds=2)
+    for key, expected in differences.items():
+        np.testing.assert_allclose(derivatives[key], expected, rtol=0.01, err_msg=key)
+        assert np.abs(expected).min() > 1e-4
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_of_all_light_are_finite_differences(name):
+    """Sampling makes both noisy: four standard errors over 8 seeds (false alarm .007 in all, by Student's t)."""
+    bsdf, directions = CASES[name]
+    directions = {f"material.{key}": d for key, d in directions.items()}
+    derivatives, differences = slopes(scene(bsdf, depth=4, sky=0.5), directions, 0.01, spp=128, seeds=8)
+    for key, expected in differences.items():
+        found = derivatives[key]
+        error = np.sqrt((found.var(ddof=1) + expected.var(ddof=1)) / 8)
+        assert abs(found.mean() - expected.mean()) < 4.0 * error, key
+        # A derivative off by a half would be seen.
+        assert error < 0.1 * abs(expected.mean()), key
+
+
+def test_optimisation_finds_a_texture():
+    """A sheet under a uniform sky, seen from above; texels are known to .02 on average and .08 at worst."""
+    wanted = np.random.default_rng(2).uniform(0.1, 0.9, (3, 3, 3))
+    bsdf = MATERIAL | {"sigma_t": 1.0, "albedo": bitmap_texture(np.full((3, 3, 3), 0.5))}
+    look = mi.ScalarTransform4f().look_at([0.0, 0.0, 4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}}
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "prb", "max_depth": 2},
+            "sensor": {"type": "perspective", "fov": 28, "to_world": look, "film": film},
+            "sky": {"type": "constant"},
+            "sheet": {"type": "rectangle", "bsdf": bsdf},
+        }
+    )
+    params, key = mi.traverse(loaded), "sheet.bsdf.albedo.data"
+    replaced(params, key, wanted)
+    params.update()
+    with dr.suspend_grad():
+        target = mi.render(loaded, spp=256, seed=0)
+
+    replaced(params, key, np.full((3, 3, 3), 0.5))
+    optimiser = mi.ad.Adam(lr=0.15, params={key: params[key]})
+    for step in range(30):
+        params.update(optimiser)
+        picture = mi.render(loaded, params, spp=16, seed=1 + step)
+        dr.backward(dr.mean(dr.square(picture - target), axis=None))
+        optimiser.set_learning_rate(0.15 * 0.91**step)
+        optimiser.step()
+        optimiser[key] = dr.clip(optimiser[key], 0.0, 1.0)
+    error = np.abs(np.array(optimiser[key]) - wanted)
+    assert error.mean() < 0.02
+    assert error.max() < 0.08
