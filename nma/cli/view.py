@@ -167,7 +167,7 @@ def demo(
     size: _Size = "256",
     spp: Annotated[int, typer.Option(help="Samples per pixel of the frames that are timed.")] = 64,
     runs: Annotated[int, typer.Option(help="Frames of each kind, with seeds of their own.")] = 3,
-    reference_spp: Annotated[int, typer.Option(help="Samples per pixel of the converged reference.")] = 768,
+    reference_spp: Annotated[int, typer.Option(help="Samples per pixel of the converged reference.")] = 512,
     variant: _Variant = "auto",
 ) -> None:
     """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.

@@ -35,7 +35,7 @@ class Settings(NamedTuple):
     size: tuple[int, int] = (256, 256)
     spp: int = 64
     runs: int = 3
-    reference_spp: int = 768
+    reference_spp: int = 512
     adapter: str = DEFAULT_ADAPTER
 
 
