@@ -17,8 +17,9 @@ from nma import ops
 from nma.ops import Float, Vec3
 from nma.table import ISOTROPIC, Grid
 
-# Points crowd towards the mirror direction down to this microfacet width.
-_FINEST = 0.002
+# Points crowd towards the mirror direction down to this microfacet width: half of the narrowest lobe's, as coarser
+# points make training broaden such lobes.
+FINEST = 0.0005
 
 # Kronecker lattice in three dimensions: powers of the inverse of the root of x^4 = x + 1 (Roberts 2018).
 _LATTICE = np.array([1.2207440846057596 ** -(k + 1) for k in range(3)])
@@ -37,7 +38,14 @@ def lattice(n: int) -> NDArray[np.float64]:
     return (np.arange(n)[:, None] * _LATTICE + 0.5) % 1.0
 
 
-def bin_points(i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid: Grid = ISOTROPIC) -> Points:
+def bin_points(
+    i: Float,
+    o: Float,
+    p: Float,
+    u: tuple[Float, Float, Float],
+    grid: Grid = ISOTROPIC,
+    finest: float = FINEST,
+) -> Points:
     """The point `u` of the unit cube, placed in the bin (theta_i, theta_o, phi) = (i, o, p), given as floats."""
     width = 1.0 / grid.theta_i
     mu_mid = (i + 0.5) * width
@@ -45,7 +53,7 @@ def bin_points(i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid
     # The difference of the cosines, crowded around 0 where the mirror direction lies. For all pairs of cosines in the
     # bin it has a triangular distribution around `centre`.
     centre = (o - i) * width
-    s, s_density = _crowd(u[0], centre - width, centre + width, (2.0 * _FINEST) * sin_mid + 1e-5)
+    s, s_density = _crowd(u[0], centre - width, centre + width, (2.0 * finest) * sin_mid + 1e-5)
     room = ops.maximum(width - ops.absolute(s - centre), 1e-7 * width)
     # One of the pairs with this difference.
     mu_low = ops.maximum(i * width, o * width - s)
@@ -54,23 +62,9 @@ def bin_points(i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid
     # The azimuth away from the mirror direction, crowded around 0 too.
     step = math.pi / grid.phi_o
     low = (grid.phi_o - 1.0 - p) * step
-    psi, psi_density = _crowd(u[2], low, low + step, ops.minimum((2.0 * _FINEST) * mu_mid / sin_mid, 1.0))
+    psi, psi_density = _crowd(u[2], low, low + step, ops.minimum((2.0 * finest) * mu_mid / sin_mid, 1.0))
     weight = room / (s_density * (width * width)) / (psi_density * step)
     return Points(*_directions(mu_i, mu_o, psi), weight)
-
-
-def bin_points_at(mu_i: Float, o: Float, p: Float, u: tuple[Float, Float], grid: Grid = ISOTROPIC) -> Points:
-    """Points of wo in the bin (o, p) for the given cos(theta_i): the average is over wo alone."""
-    width = 1.0 / grid.theta_o
-    sin_i = ops.safe_sqrt(1.0 - mu_i * mu_i)
-    low = o * width - mu_i
-    s, s_density = _crowd(u[0], low, low + width, (2.0 * _FINEST) * sin_i + 1e-5)
-    mu_o = ops.clip(mu_i + s, 1e-6, 1.0)
-    step = math.pi / grid.phi_o
-    low = (grid.phi_o - 1.0 - p) * step
-    scale = ops.clip((2.0 * _FINEST) * mu_i / ops.maximum(sin_i, 1e-4), 1e-6, 1.0)
-    psi, psi_density = _crowd(u[1], low, low + step, scale)
-    return Points(*_directions(mu_i, mu_o, psi), 1.0 / (s_density * width * psi_density * step))
 
 
 def _directions(mu_i: Float, mu_o: Float, psi: Float) -> tuple[Vec3, Vec3]:

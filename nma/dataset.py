@@ -8,9 +8,8 @@ need no coordination: should two of them simulate one material, they write the s
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -203,9 +202,3 @@ def _create_array(path: Path, settings: Settings) -> None:
             )
     except OSError as e:
         raise DatasetError(f"{path}: cannot create a dataset there ({e})") from None
-
-
-def stream(settings: Settings, block: int = _BLOCK, first: int = 0) -> Iterator[Tables]:
-    """Fresh materials for ever, `block` at a time, from index `first` on; nothing is stored."""
-    for start in itertools.count(first, block):
-        yield simulate_block(settings, range(start, start + block))

@@ -7,14 +7,13 @@ import shutil
 import signal
 import subprocess
 import sys
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nma import dataset
-from nma.dataset import Dataset, Settings, draw_params, simulate_block, stream
+from nma.dataset import Dataset, Settings, draw_params, simulate_block
 from nma.errors import DatasetError
 from nma.table import ISOTROPIC
 
@@ -163,16 +162,6 @@ def test_materials_depend_on_seed_and_index_alone():
     np.testing.assert_array_equal(draw_params(more, range(24)), params)
     other = draw_params(Settings("layered3", 24, 40_000, 8), range(24))
     assert (other[:, 0] != params[:, 0]).all()
-
-
-def test_streams_yield_the_tables_of_the_dataset(whole):
-    tables = whole.load()
-    first, second = islice(stream(SETTINGS, block=3), 2)
-    for start, block in ((0, first), (3, second)):
-        np.testing.assert_array_equal(block.values.astype(np.float16), tables.values[start : start + 3])
-        np.testing.assert_array_equal(block.params, tables.params[start : start + 3])
-    later = next(stream(SETTINGS, block=2, first=10))
-    np.testing.assert_array_equal(later.values.astype(np.float16), tables.values[10:12])
 
 
 def test_a_missing_chunk_is_refused_with_the_command_that_completes_it(copy):

@@ -21,6 +21,7 @@ _Points = Annotated[int | None, typer.Option(help="Points per bin of the AvA est
 _PointsLaw = Annotated[
     str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")
 ]
+_Finest = Annotated[float | None, typer.Option(help="Microfacet width down to which points crowd.")]
 _Loss = Annotated[str | None, typer.Option(help="huber, or log (the paper's eq. 7).")]
 
 
@@ -53,6 +54,7 @@ def train(
     steps: _Steps = None,
     points: _Points = None,
     points_law: _PointsLaw = None,
+    finest: _Finest = None,
     loss: _Loss = None,
     learning_rate: _Rate = None,
     seed: _Seed = None,
@@ -72,6 +74,7 @@ def train(
         steps=steps,
         points=points,
         points_law=points_law,
+        finest=finest,
         loss=loss,
         learning_rate=learning_rate,
         seed=seed,
@@ -100,6 +103,7 @@ def fit(
     steps: _Steps = None,
     points: _Points = None,
     points_law: _PointsLaw = None,
+    finest: _Finest = None,
     loss: _Loss = None,
     learning_rate: _Rate = None,
     seed: _Seed = None,
@@ -122,6 +126,7 @@ def fit(
         steps=steps,
         points=points,
         points_law=points_law,
+        finest=finest,
         loss=loss,
         learning_rate=learning_rate,
         seed=seed,

@@ -31,8 +31,9 @@ def _points(batch: Batch, recipe: Recipe) -> ava.Points:
         return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(middle))
     lattice = jnp.asarray(ava.lattice(recipe.points), jnp.float32).T[:, :, None, None]
     u = (lattice + batch.shift[:, None]) % 1.0
-    place = ava.bin_points if recipe.points_law == "crowded" else ava.uniform_bin_points
-    return place(batch.i, batch.o, batch.p, tuple(u))
+    if recipe.points_law == "uniform":
+        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(u))
+    return ava.bin_points(batch.i, batch.o, batch.p, tuple(u), finest=recipe.finest)
 
 
 def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from nma.ava import FINEST
 from nma.errors import NmaError
 
 
@@ -17,6 +18,7 @@ class Recipe:
 
     - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
       one point in the middle of the bin (point supervision).
+    - `finest`: microfacet width down to which points crowd.
     - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
     - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so
       that noisy bins pull towards their mean rather than their median.
@@ -33,6 +35,7 @@ class Recipe:
     bins_per_row: int = 8
     points: int = 8
     points_law: Literal["crowded", "uniform", "centre"] = "crowded"
+    finest: float = FINEST
     bins_law: Literal["mirror", "uniform"] = "mirror"
     loss: Literal["huber", "log"] = "huber"
     energy: float = 0.05
@@ -43,7 +46,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        positive = ("rows", "bins_per_row", "points", "steps", "learning_rate", "instances")
+        positive = ("finest", "rows", "bins_per_row", "points", "steps", "learning_rate", "instances")
         for name in positive:
             if not getattr(self, name) > 0:
                 raise NmaError(f"{name} must be positive, got {getattr(self, name)}")
