@@ -123,12 +123,13 @@ def _vectors(space, params, material, draw, population, seed):
         raise typer.BadParameter("give exactly one of --params, --material and --draw")
     if params is not None:
         try:
-            with np.load(params) as f:
-                return space.check(f["params"])
-        except (OSError, KeyError, ValueError) as e:
+            with params.open("rb") as file, np.load(file) as f:
+                vectors = np.asarray(f["params"], np.float64)
+        except Exception as e:  # zipfile raises a kind of its own for damaged archives
             raise TableError(
                 f"{params}: no .npz file with an array `params` (n, {space.size}): {e}"
             ) from None
+        return space.check(vectors)
     if material:
         from nma import materials as library
 
