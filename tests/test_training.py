@@ -138,6 +138,8 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
     for change in ({"seed": 1}, {"learning_rate": 0.02}, {"loss": "log", "steps": 300}):
         with pytest.raises(NmaError, match=rf"run.ckpt.*other settings \({', '.join(change)}\)"):
             loop.resume(replace(TINY, **change), layers, path)
+    with pytest.raises(NmaError, match="other data.*delete it"):
+        loop.resume(TINY, layers, path, {"data": "another dataset"})
     whole = path.read_bytes()
     for content in (whole[: len(whole) // 2], b"", b"no archive"):
         path.write_bytes(content)

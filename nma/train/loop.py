@@ -48,12 +48,13 @@ class Run:
     log_losses: list[float] = field(default_factory=list)
     seconds: float = 0.0
     scale: float = 1.0
+    record: dict[str, Any] = field(default_factory=dict)
 
 
-def start(recipe: Recipe, layers: Layers) -> Run:
-    """A run that has not done any step."""
+def start(recipe: Recipe, layers: Layers, record: dict[str, Any] | None = None) -> Run:
+    """A run that has not done any step; `record` says where its data come from."""
     layers = [(jnp.asarray(m, jnp.float32), jnp.asarray(b, jnp.float32)) for m, b in layers]
-    return Run(State(layers, layers, _optimiser(recipe).init(layers)))
+    return Run(State(layers, layers, _optimiser(recipe).init(layers)), record=record or {})
 
 
 def train(
@@ -144,16 +145,22 @@ def save(run: Run, recipe: Recipe, path: Path) -> None:
     """Writes a checkpoint, atomically."""
     leaves = jax.tree.leaves(run.state)
     arrays: dict[str, Any] = {f"leaf{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
-    notes = {"recipe": asdict(recipe), "step": run.step, "seconds": run.seconds, "scale": run.scale}
+    notes = {
+        "recipe": asdict(recipe),
+        "record": run.record,
+        "step": run.step,
+        "seconds": run.seconds,
+        "scale": run.scale,
+    }
     partial_path = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with partial_path.open("wb") as f:
         np.savez(f, notes=json.dumps(notes), losses=run.losses, log_losses=run.log_losses, **arrays)
     partial_path.replace(path)
 
 
-def resume(recipe: Recipe, layers: Layers, path: Path) -> Run:
-    """The run stored in a checkpoint, or a new one if there is none. Another recipe is refused."""
-    run = start(recipe, layers)
+def resume(recipe: Recipe, layers: Layers, path: Path, record: dict[str, Any] | None = None) -> Run:
+    """The run stored in a checkpoint, or a new one if there is none. Another recipe, or other data, are refused."""
+    run = start(recipe, layers, record)
     if not path.exists():
         return run
     try:
@@ -168,5 +175,9 @@ def resume(recipe: Recipe, layers: Layers, path: Path) -> Run:
         raise NmaError(
             f"{path} belongs to a run with other settings ({', '.join(changed)}); delete it, or restore them"
         )
+    if notes.get("record", {}) != run.record:
+        raise NmaError(
+            f"{path} belongs to a run on other data, {notes.get('record')}; delete it, or use those data"
+        )
     state = jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(x) for x in leaves])
-    return Run(state, notes["step"], losses, log_losses, notes["seconds"], notes["scale"])
+    return Run(state, notes["step"], losses, log_losses, notes["seconds"], notes["scale"], run.record)

@@ -64,7 +64,9 @@ def train_class(
     """
     sampler = BinSampler(recipe.bins_law)
     layers = initial_layers(recipe, space)
-    run = loop.resume(recipe, layers, checkpoint) if checkpoint else loop.start(recipe, layers)
+    run = (
+        loop.resume(recipe, layers, checkpoint, record) if checkpoint else loop.start(recipe, layers, record)
+    )
     pool = Stream(data, refresh, run.step) if isinstance(data, Settings) else _constant(Pool.of(data))
     loop.train(
         recipe,
