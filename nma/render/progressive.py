@@ -50,8 +50,9 @@ def render_passes(
 
 def pass_sizes(spp: int, pixels: int) -> list[int]:
     """Samples per pixel of each pass, as equal as can be without a third size: every size compiles anew."""
-    passes = -(-spp * pixels // SAMPLES_PER_PASS)
-    each = -(-spp // min(passes, spp))
+    most = max(SAMPLES_PER_PASS // pixels, 1)
+    passes = -(-spp // most)
+    each = -(-spp // passes)
     return [each] * (spp // each) + ([spp % each] if spp % each else [])
 
 

@@ -1,0 +1,94 @@
+"""Loading of scenes and materials into Mitsuba, and rendering in passes."""
+
+import numpy as np
+import pytest
+
+import nma.render
+from nma import materials
+from nma.errors import ParamError
+from nma.render.load import SceneError, load_dict, load_scene, material_bsdf
+from nma.render.progressive import SAMPLES_PER_PASS, pass_sizes, render_passes
+from nma.render.scene import preview_scene
+
+nma.render.use("llvm_ad_rgb")
+EMPTY = {"type": "scene", "sky": {"type": "constant"}, "camera": {"type": "perspective"}}
+
+
+@pytest.mark.parametrize(
+    ("spp", "pixels"), [(1, 64), (64, 256**2), (1000, 512**2), (7, 4096**2), (5, 3 << 18)]
+)
+def test_passes_add_up_and_stay_small(spp, pixels):
+    sizes = pass_sizes(spp, pixels)
+    assert sum(sizes) == spp
+    assert len(set(sizes)) <= 2
+    assert max(sizes) == 1 or max(sizes) * pixels <= SAMPLES_PER_PASS
+
+
+def test_passes_average_to_one_picture_and_equal_seeds_repeat_it(monkeypatch):
+    monkeypatch.setattr("nma.render.progressive.SAMPLES_PER_PASS", 12 * 12 * 2)
+    scene = load_dict(preview_scene({"type": "diffuse"}, size=(12, 12), spp=1, hide_sun=True))
+    done = []
+    image = render_passes(scene, 5, seed=3, progress=done.append)
+    assert done == [2, 2, 1]
+    assert image.shape == (12, 12, 3) and image.dtype == np.float32
+    np.testing.assert_array_equal(image, render_passes(scene, 5, seed=3))
+    # Seed 4 shares no pass with seed 3, in whatever order.
+    other = render_passes(scene, 5, seed=4)
+    assert (image != other).all(axis=2).mean() > 0.9
+
+
+def test_no_samples_are_refused():
+    with pytest.raises(ParamError, match="at least 1"):
+        render_passes(load_dict(EMPTY), 0)
+
+
+def test_errors_of_plugins_are_one_line_with_place_and_cause():
+    bsdf = material_bsdf(materials.load("wet-nickel"), "layered") | {"alpha_top": 7.0}
+    with pytest.raises(SceneError) as error:
+        load_dict(preview_scene(bsdf, size=(4, 4)))
+    message = str(error.value)
+    assert "material" in message and "alpha_top is 7" in message
+    assert "\n" not in message and "Traceback" not in message and ".py" not in message
+
+
+def test_a_scene_file_may_use_material_files_beside_it(tmp_path):
+    material = materials.FOLDER / "wet-nickel.toml"
+    (tmp_path / "mine.toml").write_text(material.read_text())
+    text = '<bsdf type="layered"><string name="material" value="mine.toml"/></bsdf>'
+    text = f'<sensor type="perspective"/><shape type="sphere">{text}</shape>'
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+    scene = load_scene(tmp_path / "scene.xml", size=(6, 4))
+    assert list(scene.sensors()[0].film().size()) == [6, 4]
+    assert "alpha_top = " in str(scene.shapes()[0].bsdf())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "there is no scene file"),
+        ("<scene", "Parsing"),
+        ('<bsdf version="3.0.0" type="diffuse"/>', "no scene"),
+        ('<scene version="3.0.0"><bsdf type="velvet"/></scene>', "velvet"),
+    ],
+)
+def test_faulty_scene_files_are_refused(tmp_path, text, message):
+    if text:
+        (tmp_path / "scene.xml").write_text(text)
+    with pytest.raises(SceneError, match=message):
+        load_scene(tmp_path / "scene.xml")
+
+
+def test_a_material_becomes_a_dictionary_of_either_model():
+    material = materials.load("gold-red-lacquer")
+    adapter = material_bsdf(material, adapter="my.safetensors", clamp=True)
+    assert (adapter["type"], adapter["adapter"], adapter["clamp"]) == ("nma", "my.safetensors", True)
+    reference = material_bsdf(material, "layered")
+    assert set(reference) == {"type", *material.values}
+    assert reference["albedo"] == {"type": "rgb", "value": [0.95, 0.08, 0.03]}
+    with pytest.raises(ParamError, match="unknown model"):
+        material_bsdf(material, "principled")
+
+
+def test_unknown_variants_are_refused():
+    with pytest.raises(ParamError, match="metal_ad_rgb"):
+        nma.render.use("metal_ad_rgb")
