@@ -1,6 +1,7 @@
 """The pages about rendering do what they say: their Python runs."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ def test_python_of_the_page_on_mitsuba_runs(number, tmp_path, monkeypatch):
     render = mi.render
     monkeypatch.setattr(Adapter, "load", staticmethod(lambda name: adapter))
     monkeypatch.setattr(mi, "render", lambda *args, **kwargs: render(*args, **kwargs | {"spp": 1}))
+    monkeypatch.setattr(mi.util, "write_bitmap", partial(mi.util.write_bitmap, write_async=False))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(BLOCKS[number].replace("range(30)", "range(2)"), names)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import nma.render
 from nma import materials
@@ -87,6 +88,19 @@ def test_a_material_becomes_a_dictionary_of_either_model():
     assert reference["albedo"] == {"type": "rgb", "value": [0.95, 0.08, 0.03]}
     with pytest.raises(ParamError, match="unknown model"):
         material_bsdf(material, "principled")
+
+
+@pytest.mark.parametrize("model", ["nma", "layered"])
+def test_textures_of_eight_bits_are_what_they_evaluate_to(model, tmp_path):
+    """Byte 20 is .078 raw, and .007 of linear light; alpha_top of `wet-nickel` may be .001 to .316 for the adapter."""
+    Image.fromarray(np.full((4, 4), 20, np.uint8)).save(tmp_path / "grey.png")
+    bsdf = material_bsdf(materials.load("wet-nickel"), model)
+    bitmap = {"type": "bitmap", "filename": str(tmp_path / "grey.png")}
+    for raw in (True, False):
+        load_dict(bsdf | {"alpha_top": bitmap | {"raw": raw}, "albedo": bitmap | {"raw": raw}})
+    Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "grey.png")
+    with pytest.raises(SceneError, match="texture of alpha_top.* holds 0.0 at x=0, y=0"):
+        load_dict(bsdf | {"alpha_top": bitmap})
 
 
 def test_unknown_variants_are_refused():

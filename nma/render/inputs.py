@@ -157,8 +157,18 @@ def _check_texture(param: Param, texture: Any, bounds: Bounds, clamp: bool) -> b
 
     found = [value for key, value in mi.traverse(texture) if key.rpartition(".")[2] in ("data", "value")]
     for values in map(np.array, found):
-        _check_pixels(param, values, bounds, clamp, texture.id())
+        _check_pixels(param, _decoded(values, texture), bounds, clamp, texture.id())
     return bool(found)
+
+
+def _decoded(pixels: NDArray, texture: Any) -> NDArray:
+    """The numbers that the texture evaluates to: Mitsuba keeps pixels of 8-bit files as bytes, sRGB unless `raw`."""
+    if pixels.dtype != np.uint8:
+        return pixels
+    unit = pixels / 255.0
+    if "raw = 1" in str(texture):
+        return unit
+    return np.where(unit <= 0.04045, unit / 12.92, ((unit + 0.055) / 1.055) ** 2.4)
 
 
 def _check_pixels(param: Param, pixels: NDArray, bounds: Bounds, clamp: bool, name: str) -> None:
