@@ -3,9 +3,9 @@
     python bench/render.py [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--output out/bench]
 
 Frames of all BSDFs take turns, so that other load on the machine meets all of them; `load` is its average at start
-and end. `time` is the median wall time of a frame and `cpu` the median of its processor seconds, both after a first
-frame; `first` is what that frame took beyond the median: compilation, or little where Dr.Jit has the kernels on
-disk. The ratios are medians over rounds of a frame's time to that of `principled` in the same round. `variance` is
+and end. `time` is the median wall time of a frame and `cpu` the median of its processor seconds, without
+compilation. The ratios are medians over rounds of a frame's time to that of `principled` in the same round.
+`compile` is what the first frame takes beyond the second, alone and with an empty cache of kernels. `variance` is
 that of one frame, mean over pixels and channels, from independent seeds; `efficiency` 1 / (variance x time). `bias`
 is the root mean square of (mean of the frames - converged `layered`), less the noise of both; `smape` that of the
 same two pictures with their noise, so the line of `layered` shows how much of it is noise. `principled` is a stand-
@@ -17,12 +17,14 @@ Writes render.json and render.png: the expected error after a time, from the var
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import resource
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import emptycache  # noqa: F401
 import matplotlib
 
 matplotlib.use("Agg")
@@ -45,7 +47,7 @@ DEPTH = 6
 ADAPTERS = ("layered3-5x64", "layered3-3x32")
 COLUMNS = "  ".join(
     (
-        f"{'scene':9} {'bsdf':19} {'time s':>7} {'ratio':>6} {'cpu s':>6} {'ratio':>6} {'first s':>8}",
+        f"{'scene':9} {'bsdf':19} {'time s':>7} {'ratio':>6} {'cpu s':>6} {'ratio':>6} {'compile s':>9}",
         f"{'variance':>9} {'efficiency':>10} {'bias':>8} {'smape':>7}",
     )
 )
@@ -58,7 +60,7 @@ class Frames(NamedTuple):
     pictures: Array
     wall: Array
     cpu: Array
-    first: float
+    compile: float
 
 
 def main() -> None:
@@ -83,10 +85,11 @@ def main() -> None:
     )
     rows = []
     for scene, bsdfs in scenes(options.adapter).items():
+        compilation = {name: compile_seconds(bsdf, size, options.spp) for name, bsdf in bsdfs.items()}
         loaded = {
             name: load_dict(preview_scene(bsdf, size=size, max_depth=DEPTH)) for name, bsdf in bsdfs.items()
         }
-        frames = measure_in_turns(loaded, options.spp, options.runs)
+        frames = measure_in_turns(loaded, options.spp, options.runs, compilation)
         truth = render_passes(loaded["layered"], options.reference_spp, seed=12345).astype(np.float64)
         share = options.spp / options.reference_spp
         for name in bsdfs:
@@ -131,9 +134,12 @@ def scenes(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
     }
 
 
-def measure_in_turns(loaded: dict[str, Any], spp: int, runs: int) -> dict[str, Frames]:
-    """A first frame of every scene, then one frame of each, again and again with other seeds."""
-    first = {name: render_seconds(scene, spp, runs)[1] for name, scene in loaded.items()}
+def measure_in_turns(
+    loaded: dict[str, Any], spp: int, runs: int, compilation: dict[str, float]
+) -> dict[str, Frames]:
+    """One frame of each, again and again with other seeds, after one that compiles anew for all in memory."""
+    for scene in loaded.values():
+        render_seconds(scene, spp, runs)
     pictures: dict[str, list[Array]] = {name: [] for name in loaded}
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in loaded}
     for seed in range(runs):
@@ -144,9 +150,17 @@ def measure_in_turns(loaded: dict[str, Any], spp: int, runs: int) -> dict[str, F
             pictures[name].append(picture)
     clocks = {name: np.array(s).T for name, s in seconds.items()}
     return {
-        name: Frames(np.array(pictures[name]), wall, cpu, max(first[name] - float(np.median(wall)), 0.0))
+        name: Frames(np.array(pictures[name]), wall, cpu, compilation[name])
         for name, (wall, cpu) in clocks.items()
     }
+
+
+def compile_seconds(bsdf: dict[str, Any], size: tuple[int, int], spp: int) -> float:
+    """What a first frame takes longer than a second one, without the other BSDFs: Mitsuba compiles all in memory."""
+    gc.collect()
+    scene = load_dict(preview_scene(bsdf, size=size, max_depth=DEPTH))
+    first, second = (render_seconds(scene, spp, seed)[1] for seed in range(2))
+    return max(first - second, 0.0)
 
 
 def processor_seconds() -> float:
@@ -166,7 +180,7 @@ def row(scene: str, name: str, frames: dict[str, Frames], truth: Array, share: f
         "seconds_ratio": float(np.median(own.wall / principled.wall)),
         "cpu": float(np.median(own.cpu)),
         "cpu_ratio": float(np.median(own.cpu / principled.cpu)),
-        "first": own.first,
+        "compile": own.compile,
         "variance": variance,
         "efficiency": 1.0 / (variance * wall),
         "all_seconds": own.wall.tolist(),
@@ -188,7 +202,7 @@ def line(row: dict[str, Any]) -> str:
     """One line of the table."""
     text = (
         f"{row['scene']:9} {row['bsdf']:19} {row['seconds']:7.2f} {row['seconds_ratio']:6.2f} {row['cpu']:6.2f} "
-        f"{row['cpu_ratio']:6.2f} {row['first']:8.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"
+        f"{row['cpu_ratio']:6.2f} {row['compile']:9.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"
     )
     return text + (f" {row['bias']:8.4f} {row['smape']:7.4f}" if "bias" in row else f" {'-':>8} {'-':>7}")
 
