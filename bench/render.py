@@ -7,9 +7,10 @@ and end. `time` is the median wall time of a frame and `cpu` the median of its p
 compilation. The ratios are medians over rounds of a frame's time to that of `principled` in the same round.
 `compile` is what the first frame takes beyond the second, alone and with an empty cache of kernels. `variance` is
 that of one frame, mean over pixels and channels, from independent seeds; `efficiency` 1 / (variance x time). `bias`
-is the root mean square of (mean of the frames - converged `layered`), less the noise of both; `smape` that of the
-same two pictures with their noise, so the line of `layered` shows how much of it is noise. `principled` is a stand-
-in for its time and noise; it shows another material.
+is the root mean square of (expected picture - that of `layered`), from products of independent renderings, or what
+it lies below if it does not stand out of the noise. `smape` compares the mean of the frames with the reference,
+noise of both included: the line of `layered` shows how much that is. `principled` is a stand- in for its time and
+noise; it shows another material.
 
 Writes render.json and render.png: the expected error after a time, from the variance and the bias.
 """
@@ -90,10 +91,12 @@ def main() -> None:
             name: load_dict(preview_scene(bsdf, size=size, max_depth=DEPTH)) for name, bsdf in bsdfs.items()
         }
         frames = measure_in_turns(loaded, options.spp, options.runs, compilation)
-        truth = render_passes(loaded["layered"], options.reference_spp, seed=12345).astype(np.float64)
-        share = options.spp / options.reference_spp
+        halves = [
+            render_passes(loaded["layered"], options.reference_spp // 2, seed=seed).astype(np.float64)
+            for seed in (12345, 54321)
+        ]
         for name in bsdfs:
-            rows.append(row(scene, name, frames, truth, share))
+            rows.append(row(scene, name, frames, halves))
             print(line(rows[-1]), flush=True)
     print("\nload     {:.2f} {:.2f} {:.2f} at the end".format(*os.getloadavg()))
     options.output.mkdir(parents=True, exist_ok=True)
@@ -169,8 +172,8 @@ def processor_seconds() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def row(scene: str, name: str, frames: dict[str, Frames], truth: Array, share: float) -> dict[str, Any]:
-    """The figures of one BSDF; `share` is the samples of a frame over those of the reference `truth`."""
+def row(scene: str, name: str, frames: dict[str, Frames], halves: list[Array]) -> dict[str, Any]:
+    """The figures of one BSDF; `halves` are two independent converged pictures of `layered`."""
     own, principled = frames[name], frames["principled"]
     variance, wall = float(own.pictures.var(axis=0, ddof=1).mean()), float(np.median(own.wall))
     figures: dict[str, Any] = {
@@ -186,16 +189,28 @@ def row(scene: str, name: str, frames: dict[str, Frames], truth: Array, share: f
         "all_seconds": own.wall.tolist(),
         "all_cpu": own.cpu.tolist(),
     }
-    if name == "principled":
-        return figures
-    mean = own.pictures.mean(axis=0)
-    noise = variance / len(own.pictures)
-    noise += share * float(frames["layered"].pictures.var(axis=0, ddof=1).mean())
-    squared = float(((mean - truth) ** 2).mean()) - noise
-    # The reference has no bias; what its noise leaves of the difference is no finding.
-    figures["bias"] = 0.0 if name == "layered" else float(np.sqrt(max(squared, 0.0)))
-    figures["smape"] = errors(mean, truth)["smape"]
+    if name != "principled":
+        square, error = squared_bias(own.pictures, halves)
+        figures |= {"squared_bias": square, "squared_bias_error": error}
+        figures["smape"] = errors(own.pictures.mean(axis=0), (halves[0] + halves[1]) / 2.0)["smape"]
     return figures
+
+
+def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
+    """Mean over pixels and channels of (expectation - truth)^2, and its standard error.
+
+    Products of differences that share no sample have no noise to subtract: all pairs of frames, each with its half.
+    """
+    a, b = pictures - halves[0], pictures - halves[1]
+    pairs = len(pictures) * (len(pictures) - 1)
+    pixels = ((a.sum(axis=0) * b.sum(axis=0) - (a * b).sum(axis=0)) / pairs).mean(axis=-1)
+    return float(pixels.mean()), float(pixels.std() / np.sqrt(pixels.size))
+
+
+def bias(row: dict[str, Any]) -> float | None:
+    """The root mean square error that is no noise, or None if it does not stand out of it (two standard errors)."""
+    square, error = row["squared_bias"], row["squared_bias_error"]
+    return float(np.sqrt(square)) if square > 2.0 * error else None
 
 
 def line(row: dict[str, Any]) -> str:
@@ -204,7 +219,11 @@ def line(row: dict[str, Any]) -> str:
         f"{row['scene']:9} {row['bsdf']:19} {row['seconds']:7.2f} {row['seconds_ratio']:6.2f} {row['cpu']:6.2f} "
         f"{row['cpu_ratio']:6.2f} {row['compile']:9.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"
     )
-    return text + (f" {row['bias']:8.4f} {row['smape']:7.4f}" if "bias" in row else f" {'-':>8} {'-':>7}")
+    if "squared_bias" not in row:
+        return text + f" {'-':>8} {'-':>7}"
+    limit = np.sqrt(max(row["squared_bias"], 0.0) + 2.0 * row["squared_bias_error"])
+    found = bias(row)
+    return text + f" {f'<{limit:.4f}' if found is None else f'{found:.4f}':>8} {row['smape']:7.4f}"
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
@@ -215,11 +234,13 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     )
     for panel, scene in zip(panels, names, strict=True):
         for row in rows:
-            if row["scene"] != scene or "bias" not in row:
+            if row["scene"] != scene or "squared_bias" not in row:
                 continue
             seconds = row["seconds"] * np.geomspace(0.1, 1000.0, 100)
-            error = np.sqrt(row["bias"] ** 2 + row["variance"] * row["seconds"] / seconds)
-            panel.loglog(seconds, error, label=row["bsdf"])
+            error = np.sqrt((bias(row) or 0.0) ** 2 + row["variance"] * row["seconds"] / seconds)
+            known = row["bsdf"] == "layered" or bias(row) is not None
+            label = row["bsdf"] + ("" if known else " (bias not seen)")
+            panel.loglog(seconds, error, label=label)
         panel.set(title=f"{scene} material", xlabel="rendering time [s]")
         panel.grid(alpha=0.3)
         panel.legend()
