@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 from safetensors.numpy import save
-from test_weights import random_adapter
+from test_weights import VARIANTS, random_adapter
 
 import nma.render
 from nma import target
@@ -92,6 +92,19 @@ def test_values_are_those_of_the_adapter(weights, make):
         # Near a narrow peak single precision shows.
         assert error.mean() < (1e-5 if make is textured else 2e-4)
         assert error.max() < 1e-2
+
+
+@pytest.mark.parametrize(("instances", "directional"), VARIANTS.values(), ids=VARIANTS)
+def test_every_variant_is_shown(tmp_path, instances, directional):
+    """Of any number of instances, with parameters that follow the direction or not: against NumPy."""
+    random_adapter(instances, directional, hidden="1x4").save(tmp_path / "w.safetensors")
+    adapter, (si, rng) = Adapter.load(tmp_path / "w.safetensors"), interactions(500)
+    wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
+    found = mi.load_dict(description(tmp_path / "w.safetensors")).eval(mi.BSDFContext(), si, wo)
+    wi = np.array(si.wi, np.float64)
+    flat = adapter.numbers(LAYERED3.vector(NUMBERS), wi[2])[0].astype(np.float64)
+    blend = target.from_numbers(list(flat.T), adapter.target)
+    close(found, np.stack(target.eval(blend, Vec3(*wi), Vec3(*np.array(wo, np.float64)))), rtol=1e-2)
 
 
 @pytest.mark.parametrize("make", (description, textured))

@@ -35,9 +35,10 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             check_variant(mi.variant(), props.plugin_name())
-            name = props.get("adapter", DEFAULT_ADAPTER)
+            self.name = str(props.get("adapter", DEFAULT_ADAPTER))
             # Weights lie beside the scene, as the files of Mitsuba's own plugins do.
-            self.adapter = Adapter.load(name if name in shipped() else str(mi.file_resolver().resolve(name)))
+            found = self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
+            self.adapter = Adapter.load(found)
             self.inputs = Inputs(self.adapter.space, props, "training", props.get("clamp", False))
             self._curves = None if self.inputs.textured else Curves(self.adapter, self.inputs.columns())
             self._warned = False
@@ -56,7 +57,7 @@ def define() -> type:
                 self._curves = Curves(self.adapter, self.inputs.columns())
 
         def to_string(self) -> str:
-            return f"Nma[\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
+            return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
 
         def eval(self, ctx, si, wo, active=True):
             return self.eval_pdf(ctx, si, wo, active)[0]

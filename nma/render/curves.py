@@ -34,8 +34,7 @@ class Curves:
             columns: `mi.Float` of width 1 for each column of the class's parameter vector.
             nodes: number of cosines; two will do if the target ignores the direction.
         """
-        import mitsuba as mi
-
+        mi = _mitsuba()
         self.target = adapter.target
         self.size = adapter.size
         self.nodes = nodes if adapter.directional else 2
@@ -50,8 +49,7 @@ class Curves:
 
     def at(self, cos_theta_i: Float, active: Any = True) -> Blend:
         """The blend at cos(theta_i) in 0..1."""
-        import mitsuba as mi
-
+        mi = _mitsuba()
         position = dr.clip(cos_theta_i, 0.0, 1.0) * (self.nodes - 1)
         left = dr.minimum(mi.UInt32(position), self.nodes - 2)
         t = position - mi.Float(left)
@@ -63,15 +61,12 @@ class Curves:
         return from_numbers(flat[: self.size], self.target)
 
     def _gather(self, index: Any, active: Any) -> Any:
-        import mitsuba as mi
-
-        return dr.gather(mi.ArrayXf, self.table, index, active, shape=(PACKET, dr.width(index)))
+        return dr.gather(_mitsuba().ArrayXf, self.table, index, active, shape=(PACKET, dr.width(index)))
 
 
 def _prepare(adapter: Adapter, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
     """`Adapter.prepare` by products of matrices: a few small kernels instead of a large one to compile."""
-    import mitsuba as mi
-
+    mi = _mitsuba()
     inputs = encoding.get(adapter.encoding)(columns, cos_theta_i if adapter.directional else None)
     x = mi.TensorXf(_interleaved(inputs, dr.width(cos_theta_i)), (dr.width(cos_theta_i), len(inputs)))
     layers = [(mi.TensorXf(matrix), mi.TensorXf(bias)) for matrix, bias in adapter.layers]
@@ -81,6 +76,12 @@ def _prepare(adapter: Adapter, columns: Sequence[Float], cos_theta_i: Float) -> 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:
     """All first entries, then all second ones, ..., of numbers and arrays of that width."""
-    import mitsuba as mi
-
+    mi = _mitsuba()
     return dr.ravel(mi.ArrayXf([mi.Float(value) + dr.zeros(mi.Float, width) for value in values]))
+
+
+def _mitsuba() -> Any:
+    """Mitsuba, whose types change with the variant."""
+    import mitsuba
+
+    return mitsuba
