@@ -191,7 +191,9 @@ def _check_pixels(param: Param, pixels: NDArray, bounds: Bounds, clamp: bool, na
 
 def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     """A named material's values; its textures as Mitsuba's."""
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba  # its types change with the variant
 
     # Files lie beside the scene, as those of Mitsuba's own plugins do.
     found = mi.file_resolver().resolve(name) if name.endswith(".toml") else name
