@@ -97,8 +97,17 @@ class Adapter:
 
     @property
     def size(self) -> int:
-        """How many numbers describe the target: 23 for a blend of two."""
+        """How many numbers describe the target: 23 for the paper's blend of two."""
         return output_size(self.instances, self.target)
+
+    @property
+    def in_plane(self) -> bool:
+        """Whether the blend holds in the plane of incidence (`nma.target.Plane`) instead of every local frame."""
+        return any(p.in_plane for p in self.target)
+
+    def decode(self, raw: Sequence[Float], cos_theta_i: Float) -> Blend:
+        """The blend that the network's outputs mean."""
+        return decode(raw, self.instances, self.target, cos_theta_i)
 
     def prepare(self, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
         """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,)."""
@@ -108,7 +117,7 @@ class Adapter:
         else:
             lanes = np.broadcast_arrays(cos_theta_i, *inputs)[1:]
             raw = list(network.forward(self.layers, np.stack(lanes, axis=-1).astype(np.float32)).T)
-        return decode(raw, self.instances, self.target)
+        return self.decode(raw, cos_theta_i)
 
     def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
         """Target parameters (m, n, size) of m materials (m, columns) at n cosines (n,): curves over cos(theta_i)."""
@@ -127,6 +136,10 @@ class Adapter:
             )
         if self.instances < 1:
             raise WeightsError(f"{path}: a blend of {self.instances} instances; train again")
+        if self.in_plane and not self.directional:
+            raise WeightsError(
+                f"{path}: stretched in the plane of incidence without a direction; train again"
+            )
         inputs = encoding.size(self.encoding, self.space, self.directional)
         found = self.layers[0][0].shape[1], self.layers[-1][0].shape[0]
         if found != (inputs, self.size):

@@ -1,6 +1,7 @@
 """The Mitsuba BSDF `nma`: it shows what its adapter says, its methods agree, edits show at once, errors are clear."""
 
 import json
+import math
 
 import mitsuba as mi
 import numpy as np
@@ -40,6 +41,14 @@ def weights(tmp_path_factory):
     """A small adapter, quick to compile; what it shows is arbitrary, but varies with every parameter."""
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     random_adapter(hidden="2x8").save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def stretched_weights(tmp_path_factory):
+    """The same with lobes stretched in the plane of incidence."""
+    path = tmp_path_factory.mktemp("weights") / "stretched.safetensors"
+    random_adapter(hidden="2x8", params=target.STRETCHED_PARAMS).save(path)
     return path
 
 
@@ -108,7 +117,34 @@ def test_every_variant_is_shown(tmp_path, instances, directional):
 
 
 @pytest.mark.parametrize("make", (description, textured))
-def test_methods_agree(weights, make):
+def test_stretched_lobes_turn_with_the_view(stretched_weights, make):
+    """Isotropic all the same: turning both directions about the normal changes nothing, wherever wi stands."""
+    bsdf, ctx, (si, rng) = mi.load_dict(make(stretched_weights)), mi.BSDFContext(), interactions(2000)
+    wo = bsdf.sample(ctx, si, *drawn(rng))[0].wo
+    valid = wo.z > 0
+    adapter, wi = Adapter.load(stretched_weights), np.array(si.wi, np.float64)
+    assert adapter.in_plane
+    flat = adapter.numbers(LAYERED3.vector(NUMBERS), wi[2])[0].astype(np.float64)
+    blend = target.from_numbers(list(flat.T), adapter.target)
+    assert np.abs(blend.instances[0].anisotropic).max() > 0.5
+    plane = target.Plane.of(Vec3(*wi))
+    local = [plane.enter(Vec3(*np.array(w, np.float64))) for w in (si.wi, wo)]
+    expected = [np.where(valid, x, 0.0) for x in (*target.eval(blend, *local), target.pdf(blend, *local))]
+    for angle in (0.0, 0.7, 2.9):
+        turn = mi.Transform4f().rotate([0, 0, 1], math.degrees(angle))
+        turned, _ = interactions(2000)
+        turned.wi = turn @ si.wi
+        value, pdf = bsdf.eval_pdf(ctx, turned, turn @ wo, valid)
+        for found, wanted in zip((*np.array(value), pdf), expected, strict=True):
+            error = np.abs(np.array(found) - wanted) / (wanted + 1e-3)
+            assert error.mean() < 5e-4
+            assert error.max() < 3e-2
+
+
+@pytest.mark.parametrize("make", (description, textured))
+@pytest.mark.parametrize("stretched", (False, True), ids=("principled", "stretched"))
+def test_methods_agree(weights, stretched_weights, make, stretched):
+    weights = stretched_weights if stretched else weights
     bsdf, ctx, (si, rng) = mi.load_dict(make(weights)), mi.BSDFContext(), interactions(1000)
     wo, numbers = mi.warp.square_to_cosine_hemisphere(drawn(rng)[1]), drawn(rng)
     value, pdf = bsdf.eval_pdf(ctx, si, wo)

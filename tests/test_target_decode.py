@@ -1,5 +1,7 @@
 """Raw network outputs to blends and back."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from nma.errors import WeightsError
 from nma.ops import Vec3
 from nma.target import (
     PRINCIPLED_PARAMS,
+    STRETCHED_PARAMS,
     Blend,
     Principled,
     TargetParam,
@@ -114,8 +117,22 @@ def test_lists_of_another_length_are_refused(length):
         from_numbers([0.5] * length)
 
 
-def test_declarations_survive_a_weights_file():
-    assert params_from_json(params_to_json(FULL)) == FULL
+@pytest.mark.parametrize("params", (FULL, STRETCHED_PARAMS))
+def test_declarations_survive_a_weights_file(params):
+    assert params_from_json(params_to_json(params)) == params
+
+
+def test_stretching_fades_towards_normal_incidence():
+    """By sin^2(theta_i), and nothing else does."""
+    raw = raw_outputs(2, params=STRETCHED_PARAMS)
+    full, half, none = (
+        decode(raw, 2, STRETCHED_PARAMS, mu).instances[0] for mu in (0.0, math.sqrt(0.5), 1.0)
+    )
+    np.testing.assert_allclose(half.anisotropic, 0.5 * full.anisotropic)
+    assert np.all(none.anisotropic == 0)
+    np.testing.assert_array_equal(np.stack([*full[0], *full[1:9]]), np.stack([*none[0], *none[1:9]]))
+    assert full.anisotropic.min() < -3
+    assert full.anisotropic.max() > 0.9
 
 
 @pytest.mark.parametrize(
@@ -127,6 +144,7 @@ def test_declarations_survive_a_weights_file():
         {"name": "roughness", "scale": "cubic"},
         {"name": "base_color", "size": 1},
         {"name": "roughness", "colour": 1},
+        {"name": "roughness", "in_plane": True},
     ),
 )
 def test_senseless_declarations_are_refused(entry):

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import norm
+from scipy.stats import t as student
 
 pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_type=ImportError)
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
@@ -28,12 +29,12 @@ from nma.evaluate import tabulate_adapter
 from nma.ops import Color, Vec3
 from nma.params import LAYERED3
 from nma.table import ISOTROPIC, Tables
-from nma.target import PRINCIPLED_PARAMS, Blend, Principled
+from nma.target import PRINCIPLED_PARAMS, STRETCHED_PARAMS, Blend, Principled
 from nma.target.decode import logit
 from nma.train import loop, plot
 from nma.train import run as training
 from nma.train.data import Batch, BinSampler, Pool, Stream, batches, draw
-from nma.train.loss import bin_means, loss
+from nma.train.loss import albedos, bin_means, blend_of, loss
 from nma.train.recipe import CLASS, PAPER, SINGLE, Recipe, preset
 
 FALSE_ALARM = 1e-3
@@ -69,16 +70,20 @@ def batch_of(tables, recipe, step=0):
     return draw(Pool.of(tables), BinSampler(recipe.bins_law), recipe, step)
 
 
-def constant_layers(blend, inputs=1):
+def means_of(layers, batch, recipe):
+    return np.asarray(bin_means(blend_of(layers, batch, recipe), batch, recipe))
+
+
+def constant_layers(blend, inputs=1, params=PRINCIPLED_PARAMS):
     """A network of one layer that says `blend` whatever it sees."""
-    raw = np.array(target.encode(blend), np.float32)
+    raw = np.array(target.encode(blend, params), np.float32)
     return [(np.zeros((len(raw), inputs), np.float32), raw)]
 
 
-def constant_adapter(blend):
-    return Adapter(
-        LAYERED3, "direction", constant_layers(blend), len(blend.instances), False, PRINCIPLED_PARAMS
-    )
+def constant_adapter(blend, params=PRINCIPLED_PARAMS):
+    """One that says `blend` whatever it sees, but for what fades with the direction."""
+    layers, in_plane = constant_layers(blend, params=params), params is STRETCHED_PARAMS
+    return Adapter(LAYERED3, "direction", layers, len(blend.instances), in_plane, params)
 
 
 def test_a_run_repeats_bit_for_bit(tables):
@@ -195,23 +200,25 @@ def test_every_variant_starts_at_a_plausible_blend(tables, instances, directiona
     recipe = replace(TINY, instances=instances, directional=directional)
     layers = training.initial_layers(recipe, LAYERED3)
     assert layers[-1][1].shape == (target.output_size(instances),)
-    means = np.asarray(bin_means(layers, batch_of(tables, recipe), recipe))
+    means = means_of(layers, batch_of(tables, recipe), recipe)
     assert means.shape == (3, recipe.bins_per_row, recipe.rows)
     assert np.isfinite(means).all()
     assert (means >= 0).all()
 
 
-@pytest.mark.parametrize("law", ("crowded", "uniform"))
-def test_bin_means_in_jax_are_the_tables_of_the_evaluation(tables, law):
+@pytest.mark.parametrize(
+    ("law", "kind"), [("crowded", "principled"), ("uniform", "principled"), ("crowded", "stretched")], ids=str
+)
+def test_bin_means_in_jax_are_the_tables_of_the_evaluation(tables, law, kind):
     """The same target averaged over the same bins by two libraries, two sets of points and two programs."""
-    layers = constant_layers(BRASS)
-    adapter = constant_adapter(BRASS)
-    table = tabulate_adapter(adapter, tables.params[:1])[0]
-    recipe = replace(
-        TINY, encoding="direction", directional=False, points=256, points_law=law, rows=32, bins_law="uniform"
-    )
+    params, stretched = target.TARGETS[kind], kind == "stretched"
+    across = BRASS.instances[0]._replace(anisotropic=-3.0 if stretched else 0.0)
+    blend = BRASS._replace(instances=(across, BRASS.instances[1]))
+    table = tabulate_adapter(constant_adapter(blend, params), tables.params[:1])[0]
+    recipe = replace(TINY, encoding="direction", points=256, points_law=law, rows=32, bins_law="uniform")
+    recipe = replace(recipe, target=kind, directional=stretched)
     batch = batch_of(tables, recipe)
-    found = np.asarray(bin_means(layers, batch, recipe))
+    found = means_of(constant_layers(blend, params=params), batch, recipe)
     i, o, p = (np.broadcast_to(x, batch.o.shape).astype(int) for x in (batch.i, batch.o, batch.p))
     expected = np.moveaxis(table[i, o, p], -1, 0)
     assert np.abs(np.log1p(found) - np.log1p(expected)).mean() < 1e-3
@@ -231,7 +238,7 @@ def test_point_supervision_looks_at_the_middle_of_the_bin(tables):
     sin_o = np.sqrt(1 - mu_o**2)
     wo = Vec3(-sin_o * np.cos(away), sin_o * np.sin(away), mu_o)
     expected = np.stack(target.eval(blend, wi, wo))
-    np.testing.assert_allclose(np.asarray(bin_means(layers, batch, recipe)), expected, rtol=2e-3, atol=1e-6)
+    np.testing.assert_allclose(means_of(layers, batch, recipe), expected, rtol=2e-3, atol=1e-6)
 
 
 def compound_poisson(rng, mean, quantum, shape):
@@ -262,9 +269,11 @@ def test_the_huber_loss_seeks_the_mean_of_noisy_bins_and_the_log_loss_their_medi
         shift=np.zeros((3, 1, 4000), np.float32),
         weight=np.ones((1, 4000), np.float32),
         value=np.zeros((3, 1, 4000), np.float32),
+        albedo=np.zeros((3, 4000), np.float32),
+        albedo_shift=np.zeros((3, 2, 4000), np.float32),
         quantum=rows + np.float32(quantum),
     )
-    exact = float(np.asarray(bin_means([(matrix, raw)], batch, base))[0, 0, 0])
+    exact = float(means_of([(matrix, raw)], batch, base)[0, 0, 0])
     values = compound_poisson(rng, exact, quantum, (1, 4000))
     batch = batch._replace(value=np.broadcast_to(values, (3, 1, 4000)).astype(np.float32))
 
@@ -310,6 +319,59 @@ def test_weights_undo_the_choice_of_bins(law, count):
     assert (near > 0.1) == (law == "mirror")
 
 
+def exact_albedo(raw, mu):
+    """Directional albedo (3,) of the blend that `raw` means, by quadrature in double precision."""
+    cosines, weights = np.polynomial.legendre.leggauss(160)
+    z, phi = 0.5 * (cosines + 1.0)[:, None], (np.arange(160) + 0.5)[None] * (math.pi / 160)
+    r = np.sqrt(1.0 - z * z)
+    wi = Vec3(math.sqrt(1.0 - mu * mu), 0.0, mu)
+    value = target.eval(
+        target.decode(list(raw), 2), wi, Vec3(r * np.cos(phi), r * np.sin(phi), z + 0.0 * phi)
+    )
+    return np.array([(c.mean(axis=1) * weights).sum() * math.pi for c in value])
+
+
+def test_albedos_and_their_derivatives_are_unbiased(tables):
+    """t-tests against quadrature and its differences; the halves' product has the square of the albedo as its mean."""
+    blocks, rows = 40, 32
+    recipe = replace(TINY, encoding="direction", directional=False, rows=rows, albedo_samples=8)
+    (matrix, raw), *_ = constant_layers(BRASS)
+    batch, rng = batch_of(tables, recipe), np.random.default_rng(8)
+
+    def estimate(raw, mu, shift):
+        block = batch._replace(mu=jnp.full(rows, mu), albedo_shift=shift)
+        halves = albedos(blend_of([(matrix, raw)], block, recipe), block, recipe)
+        return halves.mean(axis=(0, 2)), (halves[0] * halves[1]).mean(axis=1)
+
+    def each(function):
+        return jax.jit(jax.vmap(function, in_axes=(None, None, 0)))
+
+    estimates, derivatives = each(estimate), each(jax.jacrev(lambda *x: estimate(*x)[0]))
+    angles, step = (0.1, 0.5, 0.98), 1e-4
+    comparisons = len(angles) * 3 * (2 + len(raw))
+    for mu in angles:
+        shifts = rng.random((blocks, 3, 2, rows), dtype=np.float32)
+        found, product = map(np.asarray, estimates(raw, mu, shifts))
+        slopes = np.asarray(derivatives(raw, mu, shifts))  # (blocks, 3, 23)
+        exact = raw.astype(np.float64)
+        expected = exact_albedo(exact, mu)
+        for channel in range(3):
+            assert_mean(found[:, channel], expected[channel], comparisons)
+            assert_mean(product[:, channel], expected[channel] ** 2, comparisons)
+        for k, change in enumerate(step * np.eye(len(raw))):
+            slope = (exact_albedo(exact + change, mu) - exact_albedo(exact - change, mu)) / (2 * step)
+            for channel in range(3):
+                assert_mean(slopes[:, channel, k], slope[channel], comparisons)
+
+
+def assert_mean(values, expected, comparisons):
+    """t-test of the mean of independent values, at the false-alarm rate shared by all comparisons of a test."""
+    spread = values.std(ddof=1) / math.sqrt(len(values))
+    # Single precision shows below this.
+    limit = student.isf(0.5 * FALSE_ALARM / comparisons, len(values) - 1)
+    assert abs(values.mean() - expected) < limit * spread + 1e-5
+
+
 def test_a_batch_is_what_the_tables_say(tables):
     batch = batch_of(tables, TINY, 3)
     pool = Pool.of(tables)
@@ -329,15 +391,28 @@ def test_a_batch_is_what_the_tables_say(tables):
     assert (batch_of(tables, TINY, 4).mu != batch.mu).all()
 
 
+def test_albedos_within_a_row_follow_its_neighbours(tables):
+    """Exact for albedos linear in the cosine; the mean over a row stays the table's, whatever the albedo."""
+    pool = Pool.of(tables)
+    rows, offsets = np.arange(40), (np.arange(8) + 0.5) / 8
+    linear = replace(pool, albedo=np.tile((0.1 + (rows + 0.5) / 50)[None, :, None], (6, 1, 3)))
+    any_albedo = replace(pool, albedo=np.random.default_rng(9).random((6, 40, 3)))
+    i, t = (x.ravel() for x in np.meshgrid(rows, offsets, indexing="ij"))
+    m, mu = i % 6, (i + t) / 40
+    np.testing.assert_allclose(linear.albedo_at(m, i, mu), np.tile(0.1 + 0.8 * mu[:, None], 3), rtol=1e-12)
+    found = any_albedo.albedo_at(m, i, mu).reshape(40, 8, 3).mean(axis=1)
+    np.testing.assert_allclose(found, any_albedo.albedo[rows % 6, rows], rtol=1e-12)
+
+
 def test_batches_come_in_order_and_stacked():
-    groups = list(batches(lambda step: Batch(*[np.full(2, step)] * 9), 3, 10, 3))
+    groups = list(batches(lambda step: Batch(*[np.full(2, step)] * len(Batch._fields)), 3, 10, 3))
     assert [first for first, _ in groups] == [3, 6, 9]
     assert [group.mu[:, 0].tolist() for _, group in groups] == [[3, 4, 5], [6, 7, 8], [9]]
 
 
 def test_a_consumer_that_leaves_early_leaves_no_thread():
     before = threading.active_count()
-    stream = batches(lambda step: Batch(*[np.full(2, step)] * 9), 0, 10**9, 5)
+    stream = batches(lambda step: Batch(*[np.full(2, step)] * len(Batch._fields)), 0, 10**9, 5)
     next(stream)
     stream.close()
     assert threading.active_count() == before
@@ -375,7 +450,10 @@ def test_streams_replace_the_oldest_first(monkeypatch):
     stream = Stream(settings, refresh=1)
     everything = simulate_block(settings, range(12)).params.astype(np.float32)
     for step in range(4):
-        held = {tuple(row) for row in stream(step).params}
+        pool = stream(step)
+        held = {tuple(row) for row in pool.params}
+        albedo = 2.0 * math.pi * pool.values.astype(np.float64).mean(axis=(2, 3))
+        np.testing.assert_allclose(pool.albedo, albedo, rtol=1e-3, atol=1e-6)
         assert held == {tuple(row) for row in everything[2 * step : 2 * step + 5]}
 
 
@@ -405,6 +483,7 @@ def test_the_plateau_schedule_halves_a_stalled_step():
         ({"average": 1.0}, "average must lie in 0 .. 1"),
         ({"loss": "l2"}, "loss is one of huber, log; got 'l2'"),
         ({"points_law": "random"}, "points_law is one of crowded, uniform, centre"),
+        ({"target": "stretched", "directional": False}, "stretched .* follows the direction"),
         ({"bins_law": "lobes"}, "bins_law is one of mirror, uniform"),
         ({"schedule": "cosine"}, "schedule is one of onecycle, plateau, constant"),
     ],

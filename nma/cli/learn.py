@@ -21,6 +21,15 @@ _Points = Annotated[int | None, typer.Option(help="Points per bin of the AvA est
 _PointsLaw = Annotated[
     str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")
 ]
+_Target = Annotated[
+    str | None,
+    typer.Option(
+        help="principled (the paper's 11 numbers), or stretched: lobes stretch along the plane of incidence."
+    ),
+]
+_Albedo = Annotated[
+    float | None, typer.Option(help="Weight of the error of the directional albedo; 0: none.")
+]
 _Finest = Annotated[float | None, typer.Option(help="Microfacet width down to which points crowd.")]
 _Loss = Annotated[str | None, typer.Option(help="huber, or log (the paper's eq. 7).")]
 
@@ -51,11 +60,13 @@ def train(
         int | None, typer.Option(help="Principled instances in the blend (1 to 5), instead of the variant's.")
     ] = None,
     network: _Network = None,
+    target: _Target = None,
     steps: _Steps = None,
     points: _Points = None,
     points_law: _PointsLaw = None,
     finest: _Finest = None,
     loss: _Loss = None,
+    albedo: _Albedo = None,
     learning_rate: _Rate = None,
     seed: _Seed = None,
 ) -> None:
@@ -71,11 +82,13 @@ def train(
     recipe = recipes.preset(
         preset,
         network=network,
+        target=target or _target(directional),
         steps=steps,
         points=points,
         points_law=points_law,
         finest=finest,
         loss=loss,
+        albedo=albedo,
         learning_rate=learning_rate,
         seed=seed,
         instances=instances or lobes,
@@ -100,11 +113,13 @@ def fit(
         str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
     ] = "blended+omega_i",
     network: _Network = None,
+    target: _Target = None,
     steps: _Steps = None,
     points: _Points = None,
     points_law: _PointsLaw = None,
     finest: _Finest = None,
     loss: _Loss = None,
+    albedo: _Albedo = None,
     learning_rate: _Rate = None,
     seed: _Seed = None,
 ) -> None:
@@ -123,11 +138,13 @@ def fit(
     recipe = recipes.preset(
         "single",
         network=network,
+        target=target or _target(directional),
         steps=steps,
         points=points,
         points_law=points_law,
         finest=finest,
         loss=loss,
+        albedo=albedo,
         learning_rate=learning_rate,
         seed=seed,
         instances=lobes,
@@ -205,6 +222,11 @@ def _variant(name: str) -> tuple[int, bool]:
     if name not in variants:
         raise typer.BadParameter(f"variant must be one of {', '.join(variants)}, got '{name}'")
     return variants[name]
+
+
+def _target(directional: bool) -> str | None:
+    """The target that a variant needs whatever the preset says: without wi there is no plane to stretch along."""
+    return None if directional else "principled"
 
 
 def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):

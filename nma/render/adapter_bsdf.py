@@ -18,7 +18,7 @@ from nma.ops import Vec3
 from nma.render.curves import MIN_COS, Curves
 from nma.render.inputs import Inputs
 from nma.render.layered import check_variant
-from nma.target import Blend
+from nma.target import Blend, Plane
 
 DEFAULT_ADAPTER = "layered3-5x64"
 
@@ -67,15 +67,17 @@ def define() -> type:
 
         def eval_pdf(self, ctx, si, wo, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return _eval_pdf(blend, si, wo, active)
+            return _eval_pdf(blend, self._plane(si), si, wo, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return _sample(blend, si, sample1, sample2, active)
+            return _sample(blend, self._plane(si), si, sample1, sample2, active)
 
         def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return *_eval_pdf(blend, si, wo, active), *_sample(blend, si, sample1, sample2, active)
+            plane = self._plane(si)
+            found = _eval_pdf(blend, plane, si, wo, active)
+            return *found, *_sample(blend, plane, si, sample1, sample2, active)
 
         def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
             """The blend at `si`, and the lanes that see the front."""
@@ -88,6 +90,10 @@ def define() -> type:
                 return self._curves.at(cos_theta_i, active), active
             return self.adapter.prepare(self.inputs.columns(si, active), cos_theta_i), active
 
+        def _plane(self, si) -> Plane:
+            """The frame that the blend holds in."""
+            return Plane.of(_vec3(si.wi)) if self.adapter.in_plane else Plane()
+
         def _warn_of_light_paths(self, ctx) -> None:
             """Says once that light traced from its source makes another picture, where it does."""
             if self._warned or ctx.mode != mi.TransportMode.Importance or not self.adapter.directional:
@@ -99,15 +105,15 @@ def define() -> type:
                 "trace paths from the light converge to another picture than `path`; use `path` or `prb`",
             )
 
-    def _eval_pdf(blend: Blend, si, wo, active):
-        value, pdf = target.eval_pdf(blend, _vec3(si.wi), _vec3(wo))
+    def _eval_pdf(blend: Blend, plane: Plane, si, wo, active):
+        value, pdf = target.eval_pdf(blend, plane.enter(_vec3(si.wi)), plane.enter(_vec3(wo)))
         return mi.Color3f(*value) & active, pdf & active
 
-    def _sample(blend: Blend, si, sample1, sample2, active):
-        wo, value, pdf = target.sample(blend, _vec3(si.wi), sample1, sample2.x, sample2.y)
+    def _sample(blend: Blend, plane: Plane, si, sample1, sample2, active):
+        wo, value, pdf = target.sample(blend, plane.enter(_vec3(si.wi)), sample1, sample2.x, sample2.y)
         valid = active & (pdf > 0)
         bs = dr.zeros(mi.BSDFSample3f)
-        bs.wo = mi.Vector3f(*wo)
+        bs.wo = mi.Vector3f(*plane.leave(wo))
         bs.pdf = pdf & valid
         bs.eta = 1.0
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)

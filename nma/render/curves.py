@@ -10,7 +10,7 @@ from nma.adapter import Adapter
 from nma.jit import dr
 from nma.ops import Float
 from nma.target.blend import Blend
-from nma.target.decode import decode, from_numbers, numbers
+from nma.target.decode import from_numbers, numbers
 
 # Over draws from the training ranges, values at the blend's own samples differed by 1e-4 on average from those of the
 # network at the same cosine, albedos by 1e-5. Closer nodes at grazing angles changed little.
@@ -71,7 +71,7 @@ def _prepare(adapter: Adapter, columns: Sequence[Float], cos_theta_i: Float) -> 
     x = mi.TensorXf(_interleaved(inputs, dr.width(cos_theta_i)), (dr.width(cos_theta_i), len(inputs)))
     layers = [(mi.TensorXf(matrix), mi.TensorXf(bias)) for matrix, bias in adapter.layers]
     raw = network.forward(layers, x)
-    return decode([raw[:, k].array for k in range(adapter.size)], adapter.instances, adapter.target)
+    return adapter.decode([raw[:, k].array for k in range(adapter.size)], cos_theta_i)
 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:

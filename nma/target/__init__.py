@@ -3,6 +3,8 @@
 from nma.target.blend import Blend, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.decode import (
     PRINCIPLED_PARAMS,
+    STRETCHED_PARAMS,
+    TARGETS,
     TargetParam,
     decode,
     encode,
@@ -10,11 +12,15 @@ from nma.target.decode import (
     numbers,
     output_size,
 )
+from nma.target.plane import Plane
 from nma.target.principled import Principled, eval_principled
 
 __all__ = [
     "PRINCIPLED_PARAMS",
+    "STRETCHED_PARAMS",
+    "TARGETS",
     "Blend",
+    "Plane",
     "Principled",
     "TargetParam",
     "decode",

@@ -25,13 +25,18 @@ ENCODE_MARGIN = (
 
 @dataclass(frozen=True)
 class TargetParam:
-    """A field of `Principled` that the network sets: its size and the range its raw outputs are decoded to."""
+    """A field of `Principled` that the network sets: its size and the range its raw outputs are decoded to.
+
+    `in_plane` belongs to `anisotropic` in isotropic classes: the x axis of the lobes lies in the plane of incidence
+    (`nma.target.plane`), and the value fades by sin^2(theta_i) towards normal incidence, where there is no such plane.
+    """
 
     name: str
     size: int = 1
     low: float = 0.0
     high: float = 1.0
     scale: Scale = "linear"
+    in_plane: bool = False
 
     def decode(self, raw: Float) -> Float:
         """Any real number to the range: its sigmoid, spread linearly or by powers."""
@@ -62,6 +67,12 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
     TargetParam("clearcoat_gloss"),
 )
 
+# Lobes of isotropic materials that are wider or narrower in the plane of incidence than a reflection's: light refracted
+# twice, say. The width along the plane is 1/6.4 to 6.9 times that across it.
+STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
+
+TARGETS = {"principled": PRINCIPLED_PARAMS, "stretched": STRETCHED_PARAMS}
+
 
 def params_to_json(params: Sequence[TargetParam]) -> list[dict[str, Any]]:
     """The declaration as plain data for a weights file."""
@@ -79,7 +90,8 @@ def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
     for p in params:
         size = 3 if p.name == "base_color" else 1
         ranged = p.low < p.high and (p.scale == "linear" or (p.scale == "log" and p.low > 0))
-        if p.name not in Principled._fields or p.size != size or not ranged:
+        known = p.name in Principled._fields and p.size == size
+        if not (known and ranged) or (p.in_plane and p.name != "anisotropic"):
             raise WeightsError(f"Target parameter {p} is not one of {Principled._fields} with a valid range.")
     return params
 
@@ -101,13 +113,17 @@ def logit(unit: Float) -> Float:
 
 
 def decode(
-    raw: Sequence[Float], n_instances: int, params: Sequence[TargetParam] = PRINCIPLED_PARAMS
+    raw: Sequence[Float],
+    n_instances: int,
+    params: Sequence[TargetParam] = PRINCIPLED_PARAMS,
+    cos_theta_i: Float = 0.0,
 ) -> Blend:
     """Raw network outputs, `output_size` of them, to a blend. Weights come from breaking a stick: each blend takes its
-    share of what the instances before it left."""
+    share of what the instances before it left. `cos_theta_i` matters to parameters that are `in_plane`."""
     size = instance_size(params)
     instances = tuple(
-        _instance(_decoded(raw[k * size : (k + 1) * size], params), params) for k in range(n_instances)
+        _instance(_decoded(raw[k * size : (k + 1) * size], params, cos_theta_i), params)
+        for k in range(n_instances)
     )
     left: Float = 1.0
     weights = []
@@ -157,9 +173,11 @@ def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPL
     return Blend(instances, (*weights, 1.0 - sum(weights)))
 
 
-def _decoded(raw: Sequence[Float], params: Sequence[TargetParam]) -> list[Float]:
+def _decoded(raw: Sequence[Float], params: Sequence[TargetParam], cos_theta_i: Float) -> list[Float]:
     ranges = [p for p in params for _ in range(p.size)]
-    return [p.decode(x) for p, x in zip(ranges, raw, strict=True)]
+    values = [p.decode(x) for p, x in zip(ranges, raw, strict=True)]
+    fade = 1.0 - cos_theta_i * cos_theta_i
+    return [v * fade if p.in_plane else v for p, v in zip(ranges, values, strict=True)]
 
 
 def _instance(values: Sequence[Float], params: Sequence[TargetParam]) -> Principled:

@@ -31,6 +31,8 @@ class Batch(NamedTuple):
     shift: NDArray[np.float32]  # (3, bins_per_row, rows) random shift of the points' lattice
     weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, undoes the choice of bins
     value: NDArray[np.float32]  # (3, bins_per_row, rows) the table
+    albedo: NDArray[np.float32]  # (3, rows) directional albedo at `mu`
+    albedo_shift: NDArray[np.float32]  # (3, 2, rows) random shifts of the samples that estimate the target's
     quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to a bin
 
 
@@ -41,11 +43,21 @@ class Pool:
     params: NDArray[np.float32]
     values: NDArray[np.floating]
     walks: NDArray[np.int64]
+    albedo: NDArray[np.float32]  # (materials, theta_i, 3)
     grid: Grid = ISOTROPIC
 
     @staticmethod
     def of(tables: Tables) -> Pool:
-        return Pool(tables.params.astype(np.float32), tables.values, tables.walks)
+        albedo = tables.albedo().astype(np.float32)
+        return Pool(tables.params.astype(np.float32), tables.values, tables.walks, albedo)
+
+    def albedo_at(self, m: NDArray, i: NDArray, mu: NDArray) -> NDArray:
+        """Directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i`: linear within a row, with the
+        slope between its neighbours and the row's own mean."""
+        last = self.grid.theta_i - 1
+        above, below = np.minimum(i + 1, last), np.maximum(i - 1, 0)
+        slope = (self.albedo[m, above] - self.albedo[m, below]) / (above - below)[:, None]
+        return self.albedo[m, i] + slope * (mu * self.grid.theta_i - i - 0.5)[:, None]
 
 
 class Stream:
@@ -63,7 +75,8 @@ class Stream:
         indices = np.arange(oldest, oldest + settings.materials)
         # Material k lives in slot k modulo the size.
         tables = simulate_block(settings, indices[np.argsort(indices % settings.materials)])
-        self._pool = Pool(tables.params.astype(np.float32), tables.values.astype(np.float16), tables.walks)
+        self._pool = Pool.of(tables)
+        self._pool.values = self._pool.values.astype(np.float16)
 
     def __call__(self, step: int) -> Pool:
         """The pool at `step`."""
@@ -73,6 +86,7 @@ class Stream:
             tables = simulate_block(self._settings, indices)
             at = indices % size
             self._pool.params[at], self._pool.values[at] = tables.params, tables.values
+            self._pool.albedo[at] = tables.albedo()
             self._replaced += 1
         return self._pool
 
@@ -114,16 +128,19 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
     m = rng.integers(len(pool.params), size=recipe.rows)
     i = rng.integers(pool.grid.theta_i, size=recipe.rows)
     o, p, weight = sampler.draw(rng, i, recipe.bins_per_row)
+    mu = (i + rng.random(recipe.rows)) / pool.grid.theta_i
     f32 = np.float32
     return Batch(
         np.ascontiguousarray(pool.params[m].T),
-        ((i + rng.random(recipe.rows)) / pool.grid.theta_i).astype(f32),
+        mu.astype(f32),
         i.astype(f32),
         o.astype(f32),
         p.astype(f32),
         rng.random((3, *o.shape), dtype=f32),
         weight.astype(f32),
         np.moveaxis(pool.values[m, i, o, p], -1, 0).astype(f32),
+        pool.albedo_at(m, i, mu).T.astype(f32),
+        rng.random((3, 2, recipe.rows), dtype=f32),
         (pool.grid.theta_i / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
     )
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from nma import ava, encoding, network, target
 from nma.network import Layers
+from nma.ops import Vec3
 from nma.train.data import Batch
 from nma.train.recipe import Recipe
 
@@ -14,13 +15,18 @@ from nma.train.recipe import Recipe
 _TOLERANCE = 0.003
 
 
-def bin_means(layers: Layers, batch: Batch, recipe: Recipe) -> jax.Array:
-    """The target's mean over each bin, (3, bins_per_row, rows), for one pass of the network per row."""
+def blend_of(layers: Layers, batch: Batch, recipe: Recipe) -> target.Blend:
+    """The target of each row, (rows,), at its cosine `mu`."""
     inputs = encoding.get(recipe.encoding)(list(batch.columns), batch.mu if recipe.directional else None)
     stacked = jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1)
     raw = network.forward(layers, stacked)
+    return target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
+
+
+def bin_means(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:
+    """The target's mean over each bin, (3, bins_per_row, rows)."""
     points = _points(batch, recipe)
-    value = target.eval(target.decode(list(raw.T), recipe.instances), points.wi, points.wo)
+    value = target.eval(blend, points.wi, points.wo)
     return jnp.stack([(c * points.weight).mean(axis=0) for c in value])
 
 
@@ -36,9 +42,24 @@ def _points(batch: Batch, recipe: Recipe) -> ava.Points:
     return ava.bin_points(batch.i, batch.o, batch.p, tuple(u), finest=recipe.finest)
 
 
+def albedos(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:
+    """Two independent unbiased estimates of the target's directional albedo, (2, 3, rows), from its own samples.
+
+    The samples are held fixed while the target changes, so that derivatives are unbiased too, and none is clipped.
+    """
+    lattice = jnp.asarray(ava.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
+    u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
+    wi = Vec3(jnp.sqrt(1.0 - batch.mu * batch.mu), 0.0 * batch.mu, batch.mu)
+    wo, _, pdf = target.sample(jax.lax.stop_gradient(blend), wi, *u)
+    value = target.eval(blend, wi, wo)
+    weight = jnp.where(pdf > 0, 1.0 / jnp.maximum(pdf, 1e-9), 0.0)
+    return jnp.stack([(c * weight).mean(axis=1) for c in value], axis=1)
+
+
 def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
     """(what is minimised, the log loss of eq. 7 against the noisy tables)."""
-    mean = bin_means(layers, batch, recipe)
+    blend = blend_of(layers, batch, recipe)
+    mean = bin_means(blend, batch, recipe)
     residual = jnp.log1p(mean) - jnp.log1p(batch.value)
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":
@@ -51,4 +72,9 @@ def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.A
     huber = jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)
     # An error d of the logarithm is an error (1 + value) d of the value itself.
     emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
-    return (huber * emphasis * batch.weight).mean(), log_loss
+    total = (huber * emphasis * batch.weight).mean()
+    if recipe.albedo > 0:
+        # The product of two independent errors has the squared error as its mean, without the estimate's variance.
+        first, second = albedos(blend, batch, recipe) - batch.albedo
+        total = total + recipe.albedo * (first * second).mean()
+    return total, log_loss

@@ -16,6 +16,8 @@ class Recipe:
     A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, with one network pass per
     row, and averages the target over `points` points per bin.
 
+    - `target`: "principled", the paper's 11 numbers per instance, or "stretched", one more that stretches the specular
+      lobe along the plane of incidence.
     - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
       one point in the middle of the bin (point supervision).
     - `finest`: microfacet width down to which points crowd.
@@ -23,6 +25,7 @@ class Recipe:
     - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so
       that noisy bins pull towards their mean rather than their median.
     - `energy`: adds this much of the linear error to the logarithmic one, so that bright bins count for their energy.
+    - `albedo`: weight of the squared error of the directional albedo, from twice `albedo_samples` samples per row.
     - `schedule`: "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls, "constant" keeps it.
     - `average`: decay of the exponential moving average of the weights; 0 means none.
     """
@@ -30,6 +33,7 @@ class Recipe:
     network: str = "5x64"
     instances: int = 2
     directional: bool = True
+    target: Literal["principled", "stretched"] = "principled"
     encoding: str = "layered3"
     rows: int = 512
     bins_per_row: int = 8
@@ -39,6 +43,8 @@ class Recipe:
     bins_law: Literal["mirror", "uniform"] = "mirror"
     loss: Literal["huber", "log"] = "huber"
     energy: float = 0.05
+    albedo: float = 0.0
+    albedo_samples: int = 8
     schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
     learning_rate: float = 3e-3
     average: float = 0.999
@@ -46,13 +52,20 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        positive = ("finest", "rows", "bins_per_row", "points", "steps", "learning_rate", "instances")
+        positive = (
+            *("finest", "rows", "bins_per_row", "points", "albedo_samples"),
+            *("steps", "learning_rate", "instances"),
+        )
         for name in positive:
             if not getattr(self, name) > 0:
                 raise NmaError(f"{name} must be positive, got {getattr(self, name)}")
         for name, hint in get_type_hints(Recipe).items():
             if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
                 raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
+        if self.target == "stretched" and not self.directional:
+            raise NmaError(
+                "a target stretched in the plane of incidence follows the direction; use principled"
+            )
         if not 0 <= self.average < 1:
             raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
 
@@ -81,8 +94,11 @@ PAPER = Recipe(
 SINGLE = Recipe(
     network="3x32",
     encoding="direction",
+    target="stretched",
     rows=160,
     bins_per_row=16,
+    albedo=0.3,
+    albedo_samples=16,
     schedule="plateau",
     learning_rate=5e-3,
     average=0.99,

@@ -40,9 +40,10 @@ def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
     """Random layers whose output starts at a plausible blend; determined by the recipe's seed."""
     instances = tuple(_INITIAL.instances[k % 2] for k in range(recipe.instances))
     blend = Blend(instances, (1.0 / recipe.instances,) * recipe.instances)
-    bias = np.array(target.encode(blend if recipe.instances != 2 else _INITIAL))
+    params = target.TARGETS[recipe.target]
+    bias = np.array(target.encode(blend if recipe.instances != 2 else _INITIAL, params))
     inputs = encoding.size(recipe.encoding, space, recipe.directional)
-    sizes = [inputs, *network.hidden(recipe.network), target.output_size(recipe.instances)]
+    sizes = [inputs, *network.hidden(recipe.network), target.output_size(recipe.instances, params)]
     return network.init(np.random.default_rng((recipe.seed, 0x1417)), sizes, bias)
 
 
@@ -120,6 +121,6 @@ def _adapter(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str,
         loop.result(run, recipe),
         recipe.instances,
         recipe.directional,
-        target.PRINCIPLED_PARAMS,
+        target.TARGETS[recipe.target],
         training,
     )
