@@ -16,8 +16,16 @@ from nma.errors import WeightsError
 from nma.network import Layers
 from nma.ops import Float
 from nma.params import SPACES, ParamSpace
-from nma.target.blend import Blend
-from nma.target.decode import TargetParam, decode, numbers, output_size, params_from_json, params_to_json
+from nma.target.blend import Blend, bounded
+from nma.target.decode import (
+    TargetParam,
+    decode,
+    from_numbers,
+    numbers,
+    output_size,
+    params_from_json,
+    params_to_json,
+)
 from nma.target.principled import DIALECT
 
 
@@ -34,7 +42,10 @@ def shipped() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Adapter:
-    """A trained network with all that belongs to it. `Adapter.load` reads one, `prepare` applies it."""
+    """A trained network with all that belongs to it. `Adapter.load` reads one, `prepare` applies it.
+
+    With `bounded`, blends are dimmed where they might reflect more light than they receive (`nma.target.bounded`).
+    """
 
     space: ParamSpace
     encoding: str
@@ -43,6 +54,7 @@ class Adapter:
     directional: bool
     target: tuple[TargetParam, ...]
     training: dict[str, Any] = field(default_factory=dict)
+    bounded: bool = False
 
     @staticmethod
     def load(name_or_path: str | Path) -> Adapter:
@@ -68,6 +80,7 @@ class Adapter:
             header.directional,
             target,
             header.training,
+            header.bounded,
         )
         adapter._check(path, header.dialect)
         return adapter
@@ -81,7 +94,8 @@ class Adapter:
             hidden=[m.shape[0] for m, _ in self.layers[:-1]],
             instances=self.instances,
             directional=self.directional,
-            reciprocal=not self.directional,
+            reciprocal=not (self.directional or self.bounded),
+            bounded=self.bounded,
             dialect=DIALECT,
             target=params_to_json(self.target),
             training=self.training,
@@ -107,7 +121,14 @@ class Adapter:
 
     def decode(self, raw: Sequence[Float], cos_theta_i: Float) -> Blend:
         """The blend that the network's outputs mean."""
-        return decode(raw, self.instances, self.target, cos_theta_i)
+        return self._bounded(decode(raw, self.instances, self.target, cos_theta_i), cos_theta_i)
+
+    def blend(self, flat: Sequence[Float], cos_theta_i: Float) -> Blend:
+        """The blend from its numbers (`numbers`) at cos(theta_i)."""
+        return self._bounded(from_numbers(flat, self.target), cos_theta_i)
+
+    def _bounded(self, blend: Blend, cos_theta_i: Float) -> Blend:
+        return bounded(blend, cos_theta_i) if self.bounded else blend
 
     def prepare(self, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
         """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,)."""

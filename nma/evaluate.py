@@ -95,9 +95,10 @@ def _by_points(
 
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
         at = row * _DIRECTIONS + k // _POINTS
-        blend = target.from_numbers([dr.gather(Float, c, at) for c in curves], adapter.target)
+        mu = dr.gather(Float, cosines, at)
+        blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
         u, v = (_shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
-        across = dr.gather(Float, cosines, at) * grid.theta_i - Float(row)
+        across = mu * grid.theta_i - Float(row)
         points = ava.uniform_bin_points(Float(row), o, p, (across, u, v), grid)
         value, pdf = target.eval_pdf(blend, points.wi, points.wo)
         value = value * (1.0 - _sharpness(pdf))
@@ -118,10 +119,10 @@ def _by_samples(
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     lane = dr.arange(UInt32, len(cosines) * _SAMPLES)
     at, k = lane // _SAMPLES, lane % _SAMPLES
-    blend = target.from_numbers([dr.gather(Float, c, at) for c in curves], adapter.target)
+    mu = dr.gather(Float, cosines, at)
+    blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
     lattice = [Float(x.astype(np.float32)) for x in ava.lattice(_SAMPLES).T]
     u = [_shifted(dr.gather(Float, x, k), _uniform(at * 3 + n, ~seed)) for n, x in enumerate(lattice)]
-    mu = dr.gather(Float, cosines, at)
     wo, value, pdf = target.sample(blend, Vec3(ops.safe_sqrt(1.0 - mu * mu), 0.0 * mu, mu), *u)
     value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
     index = bin_index(at // _DIRECTIONS, UInt32(0), wo, grid)

@@ -29,7 +29,8 @@ class Header:
 
     `parameters` repeats the class's declaration, so that other languages need no Python. `reciprocal` holds for
     adapters whose target does not depend on the view direction. `target` lists the target's numbers with their ranges,
-    `dialect` names the Principled BRDF meant. `training` is the record of how the weights came to be.
+    `dialect` names the Principled BRDF meant, and `bounded` says whether it is dimmed where it might reflect more light
+    than it receives. `training` is the record of how the weights came to be.
     """
 
     class_name: str
@@ -41,6 +42,7 @@ class Header:
     reciprocal: bool
     dialect: str
     target: list[dict[str, Any]]
+    bounded: bool = False
     training: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
 

@@ -97,6 +97,7 @@ def train(
     space = sources.get(class_name).space
     source, record = _training_data(class_name, data, stream, walks, recipe.seed)
     checkpoint = output.with_name(output.name + ".ckpt")
+    output.parent.mkdir(parents=True, exist_ok=True)
     with _TrainingBar(recipe) as bar:
         adapter, run = training.train_class(
             space, recipe, source, record, checkpoint=checkpoint, refresh=refresh, progress=bar.update

@@ -10,7 +10,7 @@ from nma.adapter import Adapter
 from nma.jit import dr
 from nma.ops import Float
 from nma.target.blend import Blend
-from nma.target.decode import from_numbers, numbers
+from nma.target.decode import numbers
 
 # Over draws from the training ranges, values at the blend's own samples differed by 1e-4 on average from those of the
 # network at the same cosine, albedos by 1e-5. Closer nodes at grazing angles changed little.
@@ -35,15 +35,14 @@ class Curves:
             nodes: number of cosines; two will do if the target ignores the direction.
         """
         mi = _mitsuba()
-        self.target = adapter.target
-        self.size = adapter.size
+        self.adapter = adapter
         self.nodes = nodes if adapter.directional else 2
         cosines = dr.maximum(dr.linspace(mi.Float, 0.0, 1.0, self.nodes), MIN_COS)
         flat = numbers(_prepare(adapter, columns, cosines), adapter.target)
 
         # Node by node, filled up to whole packets.
-        self.packets = -(-self.size // PACKET)
-        flat += [0.0] * (self.packets * PACKET - self.size)
+        self.packets = -(-adapter.size // PACKET)
+        flat += [0.0] * (self.packets * PACKET - adapter.size)
         self.table = _interleaved(flat, self.nodes)
         dr.eval(self.table)
 
@@ -58,7 +57,7 @@ class Curves:
             index = left * self.packets + packet
             ends = [self._gather(index + step * self.packets, active) for step in (0, 1)]
             flat += [dr.lerp(a, b, t) for a, b in zip(*ends, strict=True)]
-        return from_numbers(flat[: self.size], self.target)
+        return self.adapter.blend(flat[: self.adapter.size], cos_theta_i)
 
     def _gather(self, index: Any, active: Any) -> Any:
         return dr.gather(_mitsuba().ArrayXf, self.table, index, active, shape=(PACKET, dr.width(index)))

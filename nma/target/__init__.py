@@ -1,6 +1,6 @@
 """The analytic BRDF that adapters drive: a blend of Principled BRDFs, written once for every array library."""
 
-from nma.target.blend import Blend, eval, eval_pdf, lobe_alphas, pdf, sample
+from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.decode import (
     PRINCIPLED_PARAMS,
     STRETCHED_PARAMS,
@@ -23,6 +23,7 @@ __all__ = [
     "Plane",
     "Principled",
     "TargetParam",
+    "bounded",
     "decode",
     "encode",
     "eval",

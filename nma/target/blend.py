@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from nma import ops
 from nma.ops import Color, Float, Vec3
+from nma.target.albedo import lobe_albedos
 from nma.target.principled import (
     MIN_COS,
     Principled,
@@ -14,14 +15,39 @@ from nma.target.principled import (
     geometry,
     spec_alpha,
 )
-from nma.target.sampling import Albedos, lobe_albedos, sample_clearcoat, sample_diffuse, sample_spec
+from nma.target.sampling import sample_clearcoat, sample_diffuse, sample_spec
 
 
 class Blend(NamedTuple):
-    """Instances and their weights, which sum to one; with two, the first weight is the paper's `blend` (eq. 3)."""
+    """Instances and their weights, which sum to one; with two, the first weight is the paper's `blend` (eq. 3).
+
+    `scale` dims the whole: `bounded` sets it.
+    """
 
     instances: tuple[Principled, ...]
     weights: tuple[Float, ...]
+    scale: Color = Color(1.0, 1.0, 1.0)
+
+
+class Odds(NamedTuple):
+    """Chance of each lobe of an instance."""
+
+    diffuse: Float
+    spec: Float
+    clearcoat: Float
+
+
+def bounded(blend: Blend, cos_theta_i: Float) -> Blend:
+    """The blend, dimmed where its albedo at cos(theta_i) might exceed 1: each channel by the bound of its albedo.
+
+    Where every bound is below 1 nothing changes. Parameters that follow the direction are free to be dimmed by it, too;
+    a blend of constant ones would lose its reciprocity.
+    """
+    total = Color(0.0, 0.0, 0.0)
+    for p, weight in zip(blend.instances, blend.weights, strict=True):
+        albedos = lobe_albedos(p, cos_theta_i)
+        total = total + (albedos.diffuse + albedos.spec + albedos.clearcoat) * weight
+    return blend._replace(scale=Color(*(1.0 / ops.maximum(c, 1.0) for c in total)))
 
 
 def eval_pdf(blend: Blend, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
@@ -29,7 +55,9 @@ def eval_pdf(blend: Blend, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
     g = geometry(wi, wo)
     value = Color(0.0, 0.0, 0.0)
     pdf: Float = 0.0
-    for p, weight, odds in zip(blend.instances, blend.weights, lobe_probabilities(blend, g.wi), strict=True):
+    for p, weight, odds in zip(
+        blend.instances, blend.weights, lobe_probabilities(blend, g.wi.z), strict=True
+    ):
         lobes = eval_pdf_lobes(p, g)
         value = value + lobes.value * weight
         pdf = pdf + (
@@ -37,7 +65,7 @@ def eval_pdf(blend: Blend, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
             + odds.spec * lobes.spec_pdf
             + odds.clearcoat * lobes.clearcoat_pdf
         )
-    return ops.select(g.valid, value, 0.0), ops.select(g.valid, pdf, 0.0)
+    return ops.select(g.valid, value * blend.scale, 0.0), ops.select(g.valid, pdf, 0.0)
 
 
 def eval(blend: Blend, wi: Vec3, wo: Vec3) -> Color:
@@ -46,7 +74,7 @@ def eval(blend: Blend, wi: Vec3, wo: Vec3) -> Color:
     value = Color(0.0, 0.0, 0.0)
     for p, weight in zip(blend.instances, blend.weights, strict=True):
         value = value + eval_pdf_lobes(p, g).value * weight
-    return ops.select(g.valid, value, 0.0)
+    return ops.select(g.valid, value * blend.scale, 0.0)
 
 
 def pdf(blend: Blend, wi: Vec3, wo: Vec3) -> Float:
@@ -57,7 +85,7 @@ def pdf(blend: Blend, wi: Vec3, wo: Vec3) -> Float:
 def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
     """Direction `wo` from three uniform numbers in [0, 1), with `eval_pdf` of it; pdf == 0 marks an invalid sample."""
     view = Vec3(wi.x, wi.y, ops.select(wi.z > MIN_COS, wi.z, 1.0))
-    odds = lobe_probabilities(blend, view)
+    odds = lobe_probabilities(blend, view.z)
     # All diffuse lobes come first, then all specular ones, then the clearcoats.
     spec_start = sum(o.diffuse for o in odds)
     clearcoat_start = spec_start + sum(o.spec for o in odds)
@@ -81,14 +109,13 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
     return wo, value, density
 
 
-def lobe_probabilities(blend: Blend, wi: Vec3) -> tuple[Albedos, ...]:
+def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[Odds, ...]:
     """Chance of each lobe of each instance, in proportion to its share of the blend's albedo; they sum to one."""
-    albedos = [lobe_albedos(p, wi) for p in blend.instances]
-    total = sum(w * (a.diffuse + a.spec + a.clearcoat) for w, a in zip(blend.weights, albedos, strict=True))
+    albedos = [lobe_albedos(p, cos_theta_i) for p in blend.instances]
+    means = [Odds(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat) for a in albedos]
+    total = sum(w * (m.diffuse + m.spec + m.clearcoat) for w, m in zip(blend.weights, means, strict=True))
     shares = [w / total for w in blend.weights]
-    return tuple(
-        Albedos(s * a.diffuse, s * a.spec, s * a.clearcoat) for s, a in zip(shares, albedos, strict=True)
-    )
+    return tuple(Odds(s * m.diffuse, s * m.spec, s * m.clearcoat) for s, m in zip(shares, means, strict=True))
 
 
 def lobe_alphas(blend: Blend) -> tuple[tuple[Float, Float, Float], ...]:

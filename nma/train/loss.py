@@ -20,7 +20,8 @@ def blend_of(layers: Layers, batch: Batch, recipe: Recipe) -> target.Blend:
     inputs = encoding.get(recipe.encoding)(list(batch.columns), batch.mu if recipe.directional else None)
     stacked = jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1)
     raw = network.forward(layers, stacked)
-    return target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
+    blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
+    return target.bounded(blend, batch.mu) if recipe.bounds_energy else blend
 
 
 def bin_means(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:

@@ -18,6 +18,7 @@ class Recipe:
 
     - `target`: "principled", the paper's 11 numbers per instance, or "stretched", one more that stretches the specular
       lobe along the plane of incidence.
+    - `bounded`: dim the target where it might reflect more light than it receives; directional ones only.
     - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
       one point in the middle of the bin (point supervision).
     - `finest`: microfacet width down to which points crowd.
@@ -34,6 +35,7 @@ class Recipe:
     instances: int = 2
     directional: bool = True
     target: Literal["principled", "stretched"] = "principled"
+    bounded: bool = True
     encoding: str = "layered3"
     rows: int = 512
     bins_per_row: int = 8
@@ -43,7 +45,7 @@ class Recipe:
     bins_law: Literal["mirror", "uniform"] = "mirror"
     loss: Literal["huber", "log"] = "huber"
     energy: float = 0.05
-    albedo: float = 0.0
+    albedo: float = 1.0
     albedo_samples: int = 8
     schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
     learning_rate: float = 3e-3
@@ -70,6 +72,11 @@ class Recipe:
             raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
 
     @property
+    def bounds_energy(self) -> bool:
+        """Whether the target is dimmed: constant parameters stay reciprocal instead."""
+        return self.bounded and self.directional
+
+    @property
     def bins_per_step(self) -> int:
         return self.rows * self.bins_per_row
 
@@ -78,6 +85,7 @@ CLASS = Recipe()
 
 # The paper's recipe (section 3.4), for comparison.
 PAPER = Recipe(
+    bounded=False,
     encoding="raw",
     rows=1000,
     bins_per_row=1,
@@ -86,6 +94,7 @@ PAPER = Recipe(
     bins_law="uniform",
     loss="log",
     energy=0.0,
+    albedo=0.0,
     learning_rate=1e-5,
     average=0.0,
 )

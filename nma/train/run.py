@@ -123,4 +123,5 @@ def _adapter(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str,
         recipe.directional,
         target.TARGETS[recipe.target],
         training,
+        recipe.bounds_energy,
     )

@@ -1,0 +1,79 @@
+"""Energy: the bounds of the lobes' albedos hold over all parameters, and a bounded blend never gains light.
+
+Albedos are means of value / pdf over many well-spread samples of the target itself (test_target_sampling shows that
+these are exact); what is asserted leaves room for 4 standard errors, taken as if the samples were independent.
+"""
+
+import numpy as np
+import pytest
+
+from nma import ava, target
+from nma.jit import dr
+from nma.ops import Color, Vec3
+from nma.target import PRINCIPLED_PARAMS, STRETCHED_PARAMS, Blend, Principled
+from nma.target.albedo import lobe_albedos
+from nma.target.decode import output_size
+
+CASES = 1500
+SAMPLES = 2048
+
+
+def estimate(blend, mu):
+    """(albedo, standard error), each (3, CASES), of blends of NumPy arrays (CASES,) at the cosines `mu`."""
+    lane = dr.arange(dr.auto.UInt32, CASES * SAMPLES)
+    case, k = lane // SAMPLES, lane % SAMPLES
+
+    def spread(x):
+        column = dr.auto.Float(np.broadcast_to(np.asarray(x, np.float32), CASES).copy())
+        return dr.gather(dr.auto.Float, column, case)
+
+    instances = [
+        Principled(
+            *(
+                Color(*map(spread, v)) if name == "base_color" else spread(v)
+                for name, v in p._asdict().items()
+            )
+        )
+        for p in blend.instances
+    ]
+    wide = Blend(tuple(instances), tuple(map(spread, blend.weights)), Color(*map(spread, blend.scale)))
+    cosine = spread(mu)
+    u = [dr.gather(dr.auto.Float, dr.auto.Float(x.astype(np.float32)), k) for x in ava.lattice(SAMPLES).T]
+    wi = Vec3(dr.sqrt(1 - cosine * cosine), dr.zeros(dr.auto.Float, len(lane)), cosine)
+    _, value, pdf = target.sample(wide, wi, *u)
+    weights = np.stack([dr.select(pdf > 0, c / pdf, 0.0).numpy() for c in value]).reshape(3, CASES, SAMPLES)
+    return weights.mean(-1), weights.std(-1) / np.sqrt(SAMPLES)
+
+
+def random_blends(params, instances, seed, scale):
+    """Blends over the whole range of their parameters, often at its ends, at cosines with many grazing ones."""
+    rng = np.random.default_rng(seed)
+    mu = np.maximum(rng.random(CASES) ** rng.choice([1.0, 3.0], CASES), 1e-3)
+    raw = rng.normal(size=(output_size(instances, params), CASES)) * scale
+    return target.decode(list(raw), instances, params, mu), mu
+
+
+@pytest.mark.parametrize("params", (PRINCIPLED_PARAMS, STRETCHED_PARAMS), ids=("principled", "stretched"))
+def test_no_lobe_exceeds_its_bound(params):
+    """All lobes of single instances together, channel by channel; and the bounds are of use: near the truth."""
+    blend, mu = random_blends(params, 1, 1, 4.0)
+    found, error = estimate(blend, mu)
+    bound = lobe_albedos(blend.instances[0], mu)
+    bound = np.stack(bound.diffuse + bound.spec + bound.clearcoat)
+    assert (found - bound < 4 * error).all()
+    assert (bound - found).mean() < 0.08
+
+
+@pytest.mark.parametrize("instances", (1, 2, 3))
+def test_bounded_blends_never_gain_light(instances):
+    blend, mu = random_blends(STRETCHED_PARAMS, instances, 2, 4.0)
+    free, _ = estimate(blend, mu)
+    found, error = estimate(target.bounded(blend, mu), mu)
+    assert (free > 1.01).mean() > 0.02  # there is something to bound
+    assert (found - 1.0 < 4 * error).all()
+
+
+def test_dim_blends_are_left_alone():
+    dark = Principled(Color(0.5, 0.2, 0.1), 0.4, 0.3, 0.5, 0.1, 0.1, 0.1, 0.3, 0.5)
+    blend = target.bounded(Blend((dark, dark), (0.5, 0.5)), 0.7)
+    assert blend.scale == Color(1.0, 1.0, 1.0)
