@@ -1,5 +1,6 @@
 # make demo    one picture of the whole path: out/demo.png
 # make test    lint and tests
+# make figures list the experiments, and how to run them: make figures ARGS=all, or ARGS="shipped --quick"
 # make types   the type checker
 # make wheel   dist/*.whl
 # make lock    write requirements.lock anew from the newest versions
@@ -7,7 +8,7 @@
 BIN := .venv/bin
 WORKERS ?= 2
 
-.PHONY: demo test types wheel lock
+.PHONY: demo test figures types wheel lock
 demo:
 	@tools/setup.sh demo
 	$(BIN)/nma demo
@@ -17,6 +18,10 @@ test:
 	$(BIN)/ruff check --quiet .
 	$(BIN)/ruff format --quiet --check .
 	$(BIN)/python -m pytest --quiet --numprocesses $(WORKERS) $(ARGS)
+
+figures:
+	@tools/setup.sh test
+	$(BIN)/python figures $(ARGS)
 
 types:
 	@tools/setup.sh test

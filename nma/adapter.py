@@ -94,7 +94,7 @@ class Adapter:
             hidden=[m.shape[0] for m, _ in self.layers[:-1]],
             instances=self.instances,
             directional=self.directional,
-            reciprocal=not (self.directional or self.bounded),
+            reciprocal=self.reciprocal,
             bounded=self.bounded,
             dialect=DIALECT,
             target=params_to_json(self.target),
@@ -108,6 +108,11 @@ class Adapter:
         names = ["blended"] if self.instances > 1 else []
         names += ["omega_i"] if self.directional else []
         return " + ".join(names) or "single"
+
+    @property
+    def reciprocal(self) -> bool:
+        """Whether swapping wi and wo leaves f as it is: where nothing depends on wi but the lobes themselves."""
+        return not (self.directional or self.bounded)
 
     @property
     def size(self) -> int:

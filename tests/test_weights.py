@@ -69,11 +69,11 @@ def refusal(path):
 @pytest.mark.parametrize("name", ("raw", "layered3", "direction"))
 @pytest.mark.parametrize(("variant", "form"), VARIANTS.items())
 def test_an_adapter_comes_back_from_its_file(tmp_path, name, variant, form):
-    before = random_adapter(*form, name=name)
+    before = replace(random_adapter(*form, name=name), bounded=form[1])
     assert before.variant == variant
     before.save(tmp_path / "new" / "a.safetensors")
     after = Adapter.load(tmp_path / "new" / "a.safetensors")
-    for field in ("space", "encoding", "instances", "directional", "target", "training"):
+    for field in ("space", "encoding", "instances", "directional", "target", "training", "bounded"):
         assert getattr(after, field) == getattr(before, field)
     for (m, b), (m2, b2) in zip(before.layers, after.layers, strict=True):
         np.testing.assert_array_equal(m, m2)
@@ -81,6 +81,15 @@ def test_an_adapter_comes_back_from_its_file(tmp_path, name, variant, form):
     mu = np.array([0.1, 0.9])
     np.testing.assert_array_equal(after.numbers(materials(3), mu), before.numbers(materials(3), mu))
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.safetensors"]
+
+
+def test_stretched_targets_follow_the_direction(tmp_path):
+    """A plane of incidence needs one; files that say otherwise are refused."""
+    path = tmp_path / "a.safetensors"
+    random_adapter(params=target.STRETCHED_PARAMS).save(path)
+    assert Adapter.load(path).in_plane
+    random_adapter(directional=False, params=target.STRETCHED_PARAMS).save(path)
+    assert "plane of incidence" in refusal(path)
 
 
 def test_the_file_describes_itself(path):

@@ -7,8 +7,7 @@ Writes fits.json and fits.png beside this file; with --quick, three materials an
 
 from __future__ import annotations
 
-import argparse
-import json
+import sys
 import time
 from pathlib import Path
 
@@ -20,17 +19,16 @@ from nma.table import stream_keys
 from nma.train.recipe import preset
 from nma.train.run import fit_material
 
-HERE = Path(__file__).parent
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = common.parser(__doc__)
     parser.add_argument("materials", nargs="*", default=None)
-    parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     names = arguments.materials or list(nma.material_names())[: 3 if arguments.quick else None]
-    folder = Path("out/figures/fits") if arguments.quick else HERE
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = common.results(__file__, arguments.quick)
     walks, reference_walks = (4_000_000, 8_000_000) if arguments.quick else (64_000_000, 128_000_000)
     rows = [fit(name, walks, reference_walks, arguments.quick) for name in names]
     for row in rows:
@@ -41,7 +39,7 @@ def main() -> None:
         )
     losses = [row["log_loss"] for row in rows]
     print(f"log loss: median {np.median(losses):.5f}, worst {max(losses):.5f}")
-    (folder / "fits.json").write_text(json.dumps(rows, indent=1) + "\n")
+    common.write_json(folder / "fits.json", rows)
     plot(rows, folder / "fits.png")
 
 

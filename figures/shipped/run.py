@@ -9,9 +9,7 @@ shipped.png beside this file; with --quick, few materials and walks, to out/figu
 
 from __future__ import annotations
 
-import argparse
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -20,56 +18,27 @@ from matplotlib.figure import Figure
 
 import nma
 
-HERE = Path(__file__).parent
-REFERENCES = Path("out/references")
-# name: (materials, population, seed)
-SETS = {"range": (89, "range", 89), "metals": (60, "unseen_metals", 60)}
-WALKS = 64_000_000
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = common.parser(__doc__)
     parser.add_argument(
         "--adapter", action="append", help="a weights file or a shipped name; may be repeated"
     )
-    parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
-    adapters = arguments.adapter or list(nma.shipped())
-    folder = Path("out/figures/shipped") if arguments.quick else HERE
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = common.results(__file__, arguments.quick)
     results: dict[str, dict] = {}
-    for name in SETS:
-        tables = nma.Tables.load(reference(name, arguments.quick))
-        for weights in adapters:
+    for name in common.SETS:
+        tables = common.reference(name, arguments.quick)
+        for weights in arguments.adapter or list(nma.shipped()):
             label = Path(weights).stem
             evaluation = nma.evaluate_adapter(nma.Adapter.load(weights), tables)
             results.setdefault(label, {})[name] = summary(evaluation, tables)
             print(f"{label} on {name}: {json.dumps(results[label][name]['mean'])}", flush=True)
-    (folder / "shipped.json").write_text(json.dumps(results, indent=1) + "\n")
+    common.write_json(folder / "shipped.json", results)
     plot(results, folder / "shipped.png")
-
-
-def reference(name: str, quick: bool) -> Path:
-    """The reference file of a set, simulated with `nma simulate` if it is not there."""
-    count, population, seed = SETS[name]
-    count, walks = (4, 4_000_000) if quick else (count, WALKS)
-    path = REFERENCES / f"{name}-{count}x{walks}.npz"
-    if not path.exists():
-        command = [
-            "simulate",
-            "--draw",
-            count,
-            "--population",
-            population,
-            "--seed",
-            seed,
-            "--walks",
-            walks,
-            "-o",
-            path,
-        ]
-        subprocess.run([sys.executable, "-m", "nma.cli", *map(str, command)], check=True)
-    return path
 
 
 def summary(evaluation, tables) -> dict:

@@ -35,7 +35,8 @@ def info(
     facts = {
         "class": adapter.space.name,
         "variant": adapter.variant,
-        "reciprocal": not adapter.directional,
+        "reciprocal": adapter.reciprocal,
+        "bounded": adapter.bounded,
         "dialect": DIALECT,
         "encoding": adapter.encoding,
         "layers": [list(m.shape) for m, _ in adapter.layers],

@@ -96,7 +96,7 @@ def define() -> type:
 
         def _warn_of_light_paths(self, ctx) -> None:
             """Says once that light traced from its source makes another picture, where it does."""
-            if self._warned or ctx.mode != mi.TransportMode.Importance or not self.adapter.directional:
+            if self._warned or ctx.mode != mi.TransportMode.Importance or self.adapter.reciprocal:
                 return
             self._warned = True
             mi.Log(

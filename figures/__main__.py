@@ -1,0 +1,40 @@
+"""Lists the experiments, or runs them.
+
+python figures                     what there is
+python figures all [--quick]       run all of them
+python figures NAME ... [--quick]  run some
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+
+def experiments() -> dict[str, Path]:
+    """Name and script of every experiment: the folders that have a `run.py`."""
+    return {script.parent.name: script for script in sorted(HERE.glob("*/run.py"))}
+
+
+def main() -> None:
+    known, wanted = experiments(), [word for word in sys.argv[1:] if word != "--quick"]
+    if not wanted:
+        for name, script in known.items():
+            summary = (ast.get_docstring(ast.parse(script.read_text())) or "").splitlines()[0]
+            print(f"{name:12} {summary}")
+        return
+    unknown = set(wanted) - {"all", *known}
+    if unknown:
+        sys.exit(f"no experiment {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    for name in known if "all" in wanted else wanted:
+        command = [sys.executable, str(known[name]), *(["--quick"] if "--quick" in sys.argv else [])]
+        print(f"== {name}: {' '.join(command[1:])}", flush=True)
+        subprocess.run(command, check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""What the experiments share: their command line, where results go, references, and how results are written."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import nma
+
+ROOT = Path(__file__).parent.parent
+REFERENCES = ROOT / "out/references"
+# The sets of unseen materials: (materials, population, seed).
+SETS = {"range": (89, "range", 89), "metals": (60, "unseen_metals", 60)}
+REFERENCE_WALKS = 64_000_000
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """A command line with `--quick`, described by the script's docstring."""
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--quick", action="store_true", help="less of everything, in under two minutes")
+    return made
+
+
+def results(script: str, quick: bool) -> Path:
+    """Where results go: beside the script, quick ones to out/figures/NAME."""
+    home = Path(script).resolve().parent
+    folder = ROOT / "out/figures" / home.name if quick else home
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data, indent=1) + "\n")
+    print(f"{path}")
+
+
+def reference(name: str, quick: bool) -> nma.Tables:
+    """The reference tables of a set, simulated with `nma simulate` if they are not there yet."""
+    count, population, seed = SETS[name]
+    count, walks = (4, 4_000_000) if quick else (count, REFERENCE_WALKS)
+    path = REFERENCES / f"{name}-{count}x{walks}.npz"
+    if not path.exists():
+        options = {"--draw": count, "--population": population, "--seed": seed, "--walks": walks, "-o": path}
+        words = [str(word) for option in options.items() for word in option]
+        subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
+    return nma.Tables.load(path)
