@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import subprocess
 import sys
@@ -43,8 +44,12 @@ def reference(name: str, quick: bool) -> nma.Tables:
     count, population, seed = SETS[name]
     count, walks = (4, 4_000_000) if quick else (count, REFERENCE_WALKS)
     path = REFERENCES / f"{name}-{count}x{walks}.npz"
-    if not path.exists():
-        options = {"--draw": count, "--population": population, "--seed": seed, "--walks": walks, "-o": path}
-        words = [str(word) for option in options.items() for word in option]
-        subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
+    options = {"--draw": count, "--population": population, "--seed": seed, "--walks": walks, "-o": path}
+    words = [str(word) for option in options.items() for word in option]
+    REFERENCES.mkdir(parents=True, exist_ok=True)
+    with path.with_suffix(".lock").open("w") as lock:
+        # Experiments that run at the same time wait for each other's simulation.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
     return nma.Tables.load(path)

@@ -3,8 +3,9 @@
     python figures/shipped/run.py [--quick] [--adapter FILE ...]
 
 Every third of the 60 has a metal that training never saw. References of 64 M walks per material are simulated once,
-from the seeds below, into out/references (about 15 minutes on 2 cores; a killed run resumes). Writes shipped.json and
-shipped.png beside this file; with --quick, few materials and walks, to out/figures/shipped.
+from the seeds below, into out/references (about 15 minutes on 2 cores; a killed run resumes). Writes shipped.json,
+shipped.png and a model card for each adapter beside this file; with --quick, few materials and walks, to
+out/figures/shipped.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 import nma
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import card
 import common
 
 
@@ -29,14 +31,16 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     folder = common.results(__file__, arguments.quick)
+    references = {name: common.reference(name, arguments.quick) for name in common.SETS}
     results: dict[str, dict] = {}
-    for name in common.SETS:
-        tables = common.reference(name, arguments.quick)
-        for weights in arguments.adapter or list(nma.shipped()):
-            label = Path(weights).stem
-            evaluation = nma.evaluate_adapter(nma.Adapter.load(weights), tables)
-            results.setdefault(label, {})[name] = summary(evaluation, tables)
+    for weights in arguments.adapter or list(nma.shipped()):
+        adapter, label = nma.Adapter.load(weights), Path(weights).stem
+        results[label] = {}
+        for name, tables in references.items():
+            results[label][name] = summary(nma.evaluate_adapter(adapter, tables), tables)
             print(f"{label} on {name}: {json.dumps(results[label][name]['mean'])}", flush=True)
+        sets = {name: (tables, results[label][name]) for name, tables in references.items()}
+        print(card.write(weights, sets, folder, arguments.quick), flush=True)
     common.write_json(folder / "shipped.json", results)
     plot(results, folder / "shipped.png")
 

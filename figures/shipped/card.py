@@ -1,0 +1,130 @@
+"""Model cards of the shipped adapters: what they are, how good, and where they fail, with pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import nma
+import nma.render
+from nma import network
+from nma.contact_sheet import Row, contact_sheet
+from nma.image_metrics import compare_images, difference_image
+from nma.metrics import FIGURES
+from nma.render.load import load_dict
+from nma.render.progressive import render_passes
+
+WORST = 10
+LIMITS = """\
+- Only the class `layered3` within its training range: anything beyond is refused, or moved to the range where asked to.
+- The target follows the view direction, so it is not reciprocal: light tracing and bidirectional methods converge to
+  another picture.
+- Isotropic reflection only; lobes have the shapes of the Principled BRDF's. What those cannot show stays: see the worst
+  materials.
+"""
+
+
+def write(weights: str, sets: dict[str, tuple[nma.Tables, dict]], folder: Path, quick: bool) -> Path:
+    """The card of one adapter, with its pictures; `sets` has the reference tables and the results of each set."""
+    adapter, name = nma.Adapter.load(weights), Path(weights).stem
+    _histogram(sets, folder / f"{name}-errors.png")
+    captions = _worst(weights, sets, folder / f"{name}-worst.png", quick)
+    card = folder / f"{name}.md"
+    card.write_text(_text(name, adapter, sets, captions))
+    return card
+
+
+def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dict]], worst: list[str]) -> str:
+    record, count = adapter.training, network.parameters(adapter.layers)
+    data, recipe = record["dataset"], record["recipe"]
+    bound = "bounded" if adapter.bounded else "not bounded"
+    return f"""# {name}
+
+Written by `python figures/shipped/run.py`. An adapter for the class `{adapter.space.name}`: {adapter.variant}, a
+network {recipe["network"]} of {count:,} numbers, encoding `{adapter.encoding}`, energy {bound}.
+
+## Training
+{data["materials"]:,} materials with {data["walks"]:,} walks each (seed {data["seed"]}), population
+`{data["population"]}`; {record["steps"]:,} steps over {record["bins_seen"]:,} bins in {record["seconds"] / 60:.0f}
+minutes on {record["device"]} ({record["date"]}). The commands stand in [docs/training.md](../../docs/training.md),
+every setting in `nma info {name}`.
+
+## Figures on materials it has not seen
+What each means: [docs/evaluation.md](../../docs/evaluation.md). In `metals` every third material's metal was held out
+of training.
+
+{_table(sets)}
+
+![Histograms of log loss and albedo error]({name}-errors.png)
+
+## The worst materials
+{chr(10).join(f"{k + 1}. {line}" for k, line in enumerate(worst))}
+
+![The worst materials, simulated and by the adapter]({name}-worst.png)
+
+## Known limits
+{LIMITS}"""
+
+
+def _table(sets: dict[str, tuple[nma.Tables, dict]]) -> str:
+    """The mean figures as rows, one column per set, then the worst ones."""
+    rows = [("figure", *(f"{label}, {len(tables.params)}" for label, (tables, _) in sets.items()))]
+    rows.append(("---",) * len(rows[0]))
+    rows += [
+        (figure, *(f"{result['mean'][figure]:.4g}" for _, result in sets.values())) for figure in FIGURES
+    ]
+    for worst in ("worst_log_loss", "worst_albedo_error"):
+        rows.append((worst.replace("_", " "), *(f"{result[worst]:.4f}" for _, result in sets.values())))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def _histogram(sets: dict[str, tuple[nma.Tables, dict]], path: Path) -> None:
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2)
+    for ax, quantity, text in zip(
+        axes, ("log_loss", "albedo_error"), ("log loss", "albedo error"), strict=True
+    ):
+        values = [result[quantity] for _, result in sets.values()]
+        ax.hist(values, bins=25, label=list(sets))
+        ax.set(xlabel=text, ylabel="materials")
+        ax.legend()
+    figure.savefig(path, dpi=110)
+
+
+def _worst(weights: str, sets: dict[str, tuple[nma.Tables, dict]], path: Path, quick: bool) -> list[str]:
+    """Renders the materials of the largest log loss; returns a line about each."""
+    nma.render.use()
+    ranked = [
+        (loss, label, k) for label, (_, result) in sets.items() for k, loss in enumerate(result["log_loss"])
+    ]
+    rows, lines = [], []
+    for loss, label, k in sorted(ranked, reverse=True)[: 2 if quick else WORST]:
+        tables, result = sets[label]
+        params = tables.params[k]
+        truth = _render({"type": "layered"}, params, 16 if quick else 512)
+        image = _render({"type": "nma", "adapter": weights}, params, 16 if quick else 512)
+        flip = compare_images(image, truth)["flip_hdr"]
+        named = {n: np.round(params[c], 3).tolist() for n, c in nma.LAYERED3.slices.items()}
+        described = ", ".join(f"{n} {v[0] if len(v) == 1 else v}" for n, v in named.items())
+        lines.append(
+            f"{label} {k}: log loss {loss:.4f}, albedo error {result['albedo_error'][k]:.4f}, "
+            f"HDR-FLIP {flip:.3f}; {described}"
+        )
+        caption = f"log loss {loss:.4f}\nHDR-FLIP {flip:.3f}"
+        rows.append(Row(f"{label} {k}", [truth, image, difference_image(image, truth)], ["", caption, ""]))
+    contact_sheet(
+        path, rows, ("simulated", "adapter", "FLIP"), title=f"{Path(weights).stem}: the worst of both sets"
+    )
+    return lines
+
+
+def _render(bsdf: dict[str, Any], params: np.ndarray, spp: int) -> np.ndarray:
+    values = {}
+    for name, columns in nma.LAYERED3.slices.items():
+        value = params[columns].tolist()
+        values[name] = value[0] if len(value) == 1 else {"type": "rgb", "value": value}
+    scene = load_dict(nma.preview_scene({**bsdf, **values}, size=(144, 144)))
+    return render_passes(scene, spp)

@@ -1,0 +1,46 @@
+"""Every experiment of `figures/` runs in its quick form and leaves its results: a new one is tested on arrival."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXPERIMENTS = sorted(script.parent.name for script in (ROOT / "figures").glob("*/run.py"))
+
+
+def figures(*words):
+    command = [sys.executable, str(ROOT / "figures"), *words]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=600, check=False)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_quick(name):
+    folder = ROOT / "out/figures" / name
+    for old in [*folder.glob("*.json"), *folder.glob("*.png")]:
+        old.unlink()
+    run = figures(name, "--quick")
+    assert run.returncode == 0, run.stdout + run.stderr
+    found = list(folder.glob("*.json"))
+    assert found
+    assert all(json.loads(path.read_text()) for path in found)
+    assert list(folder.glob("*.png"))
+
+
+def test_committed_results_stand_beside_each_script():
+    for name in EXPERIMENTS:
+        home = ROOT / "figures" / name
+        assert list(home.glob("*.json")), f"{name} has no committed results"
+        assert list(home.glob("*.png")), f"{name} has no committed picture"
+        assert (home / "README.md").exists(), f"{name} has no README.md"
+
+
+def test_without_a_name_they_are_listed():
+    lines = figures().stdout.splitlines()
+    assert [line.split()[0] for line in lines] == EXPERIMENTS
+    assert all(len(line.split()) > 3 for line in lines)
+    unknown = figures("no-such-figure")
+    assert unknown.returncode != 0
+    assert "no experiment no-such-figure" in unknown.stderr
