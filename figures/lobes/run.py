@@ -1,0 +1,150 @@
+"""Lobes of a layered material, fitted by one Principled BRDF and by a blend of two that follows wi (paper Fig. 2).
+
+    python figures/lobes/run.py [--quick] [MATERIAL ...]
+
+Both targets are fitted to the same table of 64 M walks, and compared with an independent one of as many. Plotted are
+bin averages of f cos(theta_o) in the plane of incidence. Writes lobes.json and lobes.png beside this file; with
+--quick, one material, few walks and few steps, to out/figures/lobes.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+import nma
+from nma.table import stream_keys
+from nma.train.recipe import preset
+from nma.train.run import fit_material
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+MATERIALS = ("copper-purple-medium", "beetle-green")
+ANGLES = (20, 50, 75)  # of wi, in degrees
+# The paper's targets: the 11 numbers of a Principled BRDF for each instance.
+VARIANTS = {
+    "single": {"instances": 1, "directional": False, "target": "principled"},
+    "blended + ωi": {"instances": 2, "directional": True, "target": "principled"},
+}
+# The frame ends at so many times the value that the brightest bins but these reach.
+CUT, PEAK_BINS = 4.0, 6
+COLOURS = ("#d62728", "#2ca02c", "#1f5fd0")
+
+
+class Fit(NamedTuple):
+    """A material's reference (40, 40, 40, 3), each variant's table of that shape, and each variant's figures."""
+
+    reference: NDArray
+    tables: dict[str, NDArray]
+    figures: dict[str, dict[str, float]]
+
+
+def main() -> None:
+    parser = common.parser(__doc__)
+    parser.add_argument("materials", nargs="*", default=None)
+    arguments = parser.parse_args()
+    names = arguments.materials or MATERIALS[: 1 if arguments.quick else None]
+    folder = common.results(__file__, arguments.quick)
+    fits = {name: fit(name, arguments.quick) for name in names}
+    common.write_json(folder / "lobes.json", {name: f.figures for name, f in fits.items()})
+    plot(fits, folder / "lobes.png")
+
+
+def fit(name: str, quick: bool) -> Fit:
+    """Fits every variant to one table; the reference comes from another random stream."""
+    source, vector = nma.source("layered3"), nma.load_material(name).vector()
+    walks = 4_000_000 if quick else common.REFERENCE_WALKS
+    seen = nma.tabulate(source, vector[None], walks, stream_keys(0, [0]), error=False)
+    reference = nma.tabulate(source, vector[None], walks, stream_keys(999, [0]))
+    tables, figures = {}, {}
+    for label, changes in VARIANTS.items():
+        began = time.perf_counter()
+        recipe = preset("single", **changes, steps=150 if quick else None)
+        adapter, _ = fit_material(source.space, recipe, vector, seen, {})
+        tables[label] = nma.tabulate_adapter(adapter, vector)[0]
+        mean = nma.evaluate_adapter(adapter, reference).mean
+        figures[label] = {
+            **{k: round(mean[k], 6) for k in ("log_loss", "noise_floor", "albedo_error")},
+            "numbers": adapter.size,
+            "plane_error": plane_errors(tables[label], reference.values[0]),
+        }
+        print(f"{name}, {label}: {time.perf_counter() - began:.0f} s, {figures[label]}", flush=True)
+    return Fit(reference.values[0], tables, figures)
+
+
+def row(angle: float, rows: int) -> int:
+    """The row of a table that holds this angle of incidence [degrees]."""
+    return min(int(np.cos(np.radians(angle)) * rows), rows - 1)
+
+
+def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
+    """Angles of wo [radians], positive on the mirror's side, and values (2 theta_o, 3) in the plane of incidence."""
+    bins = table.shape[1]
+    theta = np.arccos((np.arange(bins) + 0.5) / bins)
+    values = table[row(angle, len(table))].astype(np.float64)
+    # From grazing on the side of wi (delta_phi = 0) over the normal to grazing on the mirror's (delta_phi = pi).
+    return np.concatenate([-theta, theta[::-1]]), np.concatenate([values[:, 0], values[::-1, -1]])
+
+
+def plane_errors(table: NDArray, reference: NDArray) -> dict[str, float]:
+    """Mean absolute error over the plotted bins, per angle [1/sr]."""
+    errors = {a: np.abs(in_plane(table, a)[1] - in_plane(reference, a)[1]).mean() for a in ANGLES}
+    return {f"{angle} degrees": round(float(error), 5) for angle, error in errors.items()}
+
+
+def plot(fits: dict[str, Fit], path: Path) -> None:
+    """A row for each material and variant, a column for each angle."""
+    rows = [(name, label) for name in fits for label in VARIANTS]
+    figure = Figure(figsize=(11, 1.7 * len(rows) + 0.7), layout="constrained")
+    axes = figure.subplots(len(rows), len(ANGLES), squeeze=False)
+    for line, (name, label) in zip(axes, rows, strict=True):
+        for ax, angle in zip(line, ANGLES, strict=True):
+            draw(ax, fits[name], label, angle)
+        loss = fits[name].figures[label]["log_loss"]
+        line[0].set_ylabel(f"{name}\n{label}\nlog loss {loss:.4f}", fontsize=8.5)
+    for ax, angle in zip(axes[0], ANGLES, strict=True):
+        ax.set_title(rf"$\theta_i$ = {angle}°", fontsize=10)
+    what = r"f cos $\theta_o$ [1/sr] in the plane of incidence, radius its square root; sharp peaks are cut off. "
+    figure.suptitle(what + r"Thick: reference, thin: fit, arrow: $\omega_i$", fontsize=10)
+    figure.savefig(path, dpi=110)
+
+
+def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
+    """One half disc. Radii are square roots, so that low lobes show, and reach as far for both variants."""
+    theta, reference = in_plane(fit.reference, angle)
+    across, up = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    ours = in_plane(fit.tables[label], angle)[1]
+    for values, style in (reference, {"alpha": 0.3, "linewidth": 4.5}), (ours, {"linewidth": 1.2}):
+        for x, y, colour in zip((across * np.sqrt(values)).T, (up * np.sqrt(values)).T, COLOURS, strict=True):
+            ax.plot(x, y, color=colour, **style)
+    # A sharp coat's peak, a few bins wide and far above the rest, would hide all else: it leaves the frame.
+    peak = max(in_plane(t, angle)[1].max() for t in (fit.reference, *fit.tables.values()))
+    top = 1.05 * np.sqrt(min(peak, CUT * np.sort(reference.max(axis=1))[-PEAK_BINS]))
+    scale(ax, top)
+    wi = np.array([-np.sin(np.radians(angle)), np.cos(np.radians(angle))])
+    ax.annotate("", wi * top, wi * 0.7 * top, arrowprops={"arrowstyle": "->"})
+
+
+def scale(ax: Axes, top: float) -> None:
+    """The frame of a half disc of that radius, with rings at round values and rays every 30 degrees."""
+    half = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    rings = [t for t in (0.01, 0.05, 0.2, 1, 5, 20, 100) if 0.02 * top**2 < t < top**2]
+    for radius in (top, *np.sqrt(rings)):
+        ax.plot(radius * np.sin(half), radius * np.cos(half), color="0.5", linewidth=0.4, zorder=0)
+    for ray in np.radians((-60, -30, 0, 30, 60)):
+        ax.plot([0.0, top * np.sin(ray)], [0.0, top * np.cos(ray)], color="0.8", linewidth=0.4, zorder=0)
+    ax.set(aspect="equal", xlim=(-1.01 * top, 1.01 * top), ylim=(0.0, 1.01 * top), yticks=[])
+    ax.set_xticks(np.sqrt(rings), [f"{t:g}" for t in rings], fontsize=7)
+    ax.spines[["left", "right", "top"]].set_visible(False)
+
+
+if __name__ == "__main__":
+    main()
