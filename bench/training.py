@@ -1,21 +1,27 @@
-"""Bins per second of a training step, ours and the paper's recipe, and how much of it is drawing batches.
+"""Bins per second of a training step, ours and the paper's recipe, and what part of a step each stage takes.
 
 python bench/training.py [--steps 300]
+
+Stages: drawing a batch (on a thread of its own), the network with its derivatives, the target over the points of the
+bins with its derivatives and Adam, and the term of the directional albedo. The last two are differences of whole steps.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
+import jax
 import numpy as np
 from machine import header
 
 import nma
 from nma.dataset import Settings, simulate_block
 from nma.train import loop
-from nma.train.data import BinSampler, Pool, draw
-from nma.train.recipe import preset
+from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.loss import network_outputs
+from nma.train.recipe import Recipe, preset
 from nma.train.run import initial_layers
 
 
@@ -25,18 +31,29 @@ def main() -> None:
     steps = parser.parse_args().steps
     print(header())
     pool = Pool.of(simulate_block(Settings("layered3", 16, 81_920, 0), range(16)))
-    print(f"{'recipe':22} {'ms/step':>8} {'CPU ms/step':>12} {'Mbins/s':>8} {'drawing ms':>11}")
+    columns = ("ms/step", "CPU ms", "Mbins/s", "drawing", "network", "target", "albedo")
+    print(f"{'recipe':12}" + "".join(f"{c:>9}" for c in columns))
     for name, network in (("class", "5x64"), ("class", "3x32"), ("paper", "5x64")):
         print(measure(pool, name, network, steps))
 
 
 def measure(pool: Pool, name: str, network: str, steps: int) -> str:
-    """One line of the table: a preset's training on a small pool."""
+    """One line of the table: a preset's training on a small pool, milliseconds per step."""
     recipe = preset(name, steps=steps, network=network)
     sampler = BinSampler(recipe.bins_law)
     began = time.perf_counter()
     batches = [draw(pool, sampler, recipe, k) for k in range(steps)]
-    drawing = (time.perf_counter() - began) / steps
+    drawing = 1e3 * (time.perf_counter() - began) / steps
+    step, cpu = seconds(recipe, batches)
+    without, _ = seconds(replace(recipe, albedo=0.0), batches) if recipe.albedo else (step, cpu)
+    passes = network_seconds(recipe, batches[0])
+    rate = recipe.bins_per_step / step / 1e3
+    numbers = (step, cpu, rate, drawing, passes, without - passes, step - without)
+    return f"{name + ' ' + network:12}" + "".join(f"{x:9.2f}" for x in numbers)
+
+
+def seconds(recipe: Recipe, batches: list[Batch]) -> tuple[float, float]:
+    """Milliseconds of a whole step, on the clock and of all cores."""
     clock: list[tuple[float, float]] = []
     run = loop.start(recipe, initial_layers(recipe, nma.LAYERED3))
     loop.train(
@@ -46,10 +63,19 @@ def measure(pool: Pool, name: str, network: str, steps: int) -> str:
         progress=lambda _: clock.append((time.perf_counter(), time.process_time())),
     )
     # The first group compiles.
-    wall, cpu = (np.array(clock[-1]) - np.array(clock[0])) / (steps - loop.GROUP)
-    rate = recipe.bins_per_step / wall / 1e6
-    label = f"{name} {network}"
-    return f"{label:22} {wall * 1e3:8.2f} {cpu * 1e3:12.2f} {rate:8.2f} {drawing * 1e3:11.2f}"
+    wall, cpu = (np.array(clock[-1]) - np.array(clock[0])) / (recipe.steps - loop.GROUP)
+    return 1e3 * wall, 1e3 * cpu
+
+
+def network_seconds(recipe: Recipe, batch: Batch, repeats: int = 200) -> float:
+    """Milliseconds of the network's pass over a batch, there and back."""
+    layers = initial_layers(recipe, nma.LAYERED3)
+    passes = jax.jit(jax.grad(lambda layers: (network_outputs(layers, batch, recipe) ** 2).sum()))
+    jax.block_until_ready(passes(layers))
+    began = time.perf_counter()
+    for _ in range(repeats):
+        jax.block_until_ready(passes(layers))
+    return 1e3 * (time.perf_counter() - began) / repeats
 
 
 if __name__ == "__main__":

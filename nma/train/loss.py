@@ -15,11 +15,15 @@ from nma.train.recipe import Recipe
 _TOLERANCE = 0.003
 
 
-def blend_of(layers: Layers, batch: Batch, recipe: Recipe) -> target.Blend:
-    """The target of each row, (rows,), at its cosine `mu`."""
+def network_outputs(layers: Layers, batch: Batch, recipe: Recipe) -> jax.Array:
+    """(rows, numbers of the target), one pass of the network per row, at its cosine `mu`."""
     inputs = encoding.get(recipe.encoding)(list(batch.columns), batch.mu if recipe.directional else None)
-    stacked = jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1)
-    raw = network.forward(layers, stacked)
+    return network.forward(layers, jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1))
+
+
+def blend_of(layers: Layers, batch: Batch, recipe: Recipe) -> target.Blend:
+    """The target of each row, (rows,)."""
+    raw = network_outputs(layers, batch, recipe)
     blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
     return target.bounded(blend, batch.mu) if recipe.bounds_energy else blend
 
