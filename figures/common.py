@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import fcntl
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -53,3 +54,8 @@ def reference(name: str, quick: bool) -> nma.Tables:
         if not path.exists():
             subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
     return nma.Tables.load(path)
+
+
+def row(angle: float, rows: int) -> int:
+    """The row of a table that holds this angle of incidence [degrees]."""
+    return min(int(math.cos(math.radians(angle)) * rows), rows - 1)

@@ -12,6 +12,7 @@ import typer
 
 from nma import cli, encoding, network
 from nma.adapter import Adapter
+from nma.cli.learn import _finite
 from nma.image_io import read_image, write_exr
 from nma.metrics import FIGURES
 from nma.params import LAYERED3
@@ -120,6 +121,11 @@ def test_simulate_and_evaluate_print_one_json_object_and_nothing_else(nma, weigh
         assert np.isfinite(list(figures.values())).all()
     for name in FIGURES:
         assert result["mean"][name] == pytest.approx(np.mean([m[name] for m in result["materials"]]))
+
+
+def test_json_has_no_infinity():
+    """The PSNR of equal tables is infinite."""
+    assert _finite({"psnr": float("inf"), "ae": 0.0}) == {"psnr": None, "ae": 0.0}
 
 
 @pytest.mark.parametrize("model", ["nma", "layered"])

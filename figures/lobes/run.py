@@ -80,16 +80,11 @@ def fit(name: str, quick: bool) -> Fit:
     return Fit(reference.values[0], tables, figures)
 
 
-def row(angle: float, rows: int) -> int:
-    """The row of a table that holds this angle of incidence [degrees]."""
-    return min(int(np.cos(np.radians(angle)) * rows), rows - 1)
-
-
 def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
     """Angles of wo [radians], positive on the mirror's side, and values (2 theta_o, 3) in the plane of incidence."""
     bins = table.shape[1]
     theta = np.arccos((np.arange(bins) + 0.5) / bins)
-    values = table[row(angle, len(table))].astype(np.float64)
+    values = table[common.row(angle, len(table))].astype(np.float64)
     # From grazing on the side of wi (delta_phi = 0) over the normal to grazing on the mirror's (delta_phi = pi).
     return np.concatenate([-theta, theta[::-1]]), np.concatenate([values[:, 0], values[::-1, -1]])
 

@@ -52,18 +52,13 @@ def chosen(tables: nma.Tables) -> nma.Tables:
     return nma.Tables(tables.params[picked], tables.values[picked], tables.walks[picked], error)
 
 
-def row(angle: float, rows: int) -> int:
-    """The row of a table that holds this angle of incidence [degrees]."""
-    return min(int(np.cos(np.radians(angle)) * rows), rows - 1)
-
-
 def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
     """Mean absolute errors per slice [1/sr] next to the slice's mean, and what the reference's noise adds to them."""
     slices = []
     for m, params in enumerate(tables.params):
         entry: dict = {"params": [round(float(x), 5) for x in params]}
         for angle in ANGLES:
-            at = m, row(angle, adapter.shape[1])
+            at = m, common.row(angle, adapter.shape[1])
             reference = tables.values[at].astype(np.float64)
             figures = {
                 "mean_absolute_error": np.abs(adapter[at] - reference).mean(),
@@ -109,7 +104,7 @@ def plot(tables: nma.Tables, adapter: NDArray, label: str, path: Path) -> None:
     for m in range(count):
         axes[0, m].set_title(caption(tables.params[m]), fontsize=7.5)
         for k, angle in enumerate(ANGLES):
-            at = m, row(angle, adapter.shape[1])
+            at = m, common.row(angle, adapter.shape[1])
             reference, ours = tables.values[at].astype(np.float64), adapter[at].astype(np.float64)
             error = np.abs(ours - reference).mean(axis=-1, keepdims=True)
             for ax, values in zip(axes[3 * k :, m], (reference, ours), strict=False):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -195,7 +196,7 @@ def evaluate(
 
         result = run(adapter, tables, progress, clamp=clamp)
     if as_json:
-        print(json.dumps({"mean": result.mean, "materials": result.materials}))
+        print(json.dumps({"mean": _finite(result.mean), "materials": [_finite(m) for m in result.materials]}))
         return
     rows = [(str(n), *(m[f] for f in FIGURES)) for n, m in enumerate(result.materials)]
     rows.append(("mean", *(result.mean[f] for f in FIGURES)))
@@ -210,6 +211,11 @@ def evaluate(
         console.out.print(
             "The reference has no standard errors; its noise floor is an upper bound from counting walks."
         )
+
+
+def _finite(figures: dict[str, float]) -> dict[str, float | None]:
+    """The figures for JSON, which has no infinity: the PSNR of equal tables becomes null."""
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 
 def _variant(name: str) -> tuple[int, bool]:

@@ -1,0 +1,136 @@
+"""Shader balls of validation materials: rendered once, kept, and compared with the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from train import Job, Store
+
+import nma
+from nma.contact_sheet import Row, contact_sheet
+from nma.image_metrics import METRICS
+from nma.materials import Material
+from nma.render.load import load_dict, material_bsdf
+from nma.render.progressive import render_passes
+
+Images = NDArray[np.float32]
+# Seeds of the renderings: the references' own, and that of the second one, which shows what noise alone scores.
+REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
+
+
+class View(NamedTuple):
+    """How materials are rendered: the first `materials` of the validation set, at `size` x `size` pixels."""
+
+    materials: int = 24
+    size: int = 160
+    spp: int = 256
+    reference_spp: int = 2048
+
+
+class Gallery:
+    """Pictures (materials, height, width, 3) of the reference and of adapters, kept in the store's folder."""
+
+    def __init__(self, store: Store, view: View, validation: str):
+        self._store, self._view, self._validation = store, view, validation
+        rows = store.validation.params[: view.materials]
+        self.materials = [material(number, row) for number, row in enumerate(rows)]
+        self.reference = self._simulated(view.reference_spp, REFERENCE_SEED)
+
+    def noise(self) -> dict[str, float]:
+        """What the reference scores against itself, rendered like an adapter: the best that can be had."""
+        return compare(self._simulated(self._view.spp, NOISE_SEED), self.reference)
+
+    def metrics(self, job: Job, adapter: nma.Adapter) -> dict[str, float]:
+        """The image metrics of an adapter, means over the materials."""
+        settings = {"view": self._view._asdict(), "validation": self._validation}
+        return self._store.cached(
+            job, "images", settings, adapter, lambda: compare(self.pictures(job, adapter), self.reference)
+        )
+
+    def pictures(self, job: Job, adapter: nma.Adapter) -> Images:
+        """The adapter's pictures, rendered again where its weights are newer."""
+        weights = self._store.weights(job)
+
+        def bsdf(material: Material) -> dict[str, Any]:
+            return material_bsdf(material, "nma", adapter=weights)
+
+        return self._kept(job.stem, bsdf, self._view.spp, ADAPTER_SEED, newer_than=weights)
+
+    def _simulated(self, spp: int, seed: int) -> Images:
+        return self._kept("reference", lambda m: material_bsdf(m, "layered"), spp, seed)
+
+    def _kept(
+        self,
+        name: str,
+        bsdf: Callable[[Material], dict[str, Any]],
+        spp: int,
+        seed: int,
+        newer_than: Path | None = None,
+    ) -> Images:
+        view = self._view
+        words = f"{name}_{self._validation}_{view.materials}x{view.size}px_{spp}-spp_seed-{seed}.npy"
+        path = self._store.folder / "pictures" / words
+        if path.exists() and (newer_than is None or path.stat().st_mtime > newer_than.stat().st_mtime):
+            return np.load(path)
+        pictures = np.stack([render(bsdf(m), view.size, spp, seed) for m in self.materials])
+        path.parent.mkdir(exist_ok=True)
+        # A whole file or none, whenever the run is killed.
+        temporary = path.with_suffix(".partial.npy")
+        np.save(temporary, pictures)
+        temporary.replace(path)
+        print(f"{path.name}", flush=True)
+        return pictures
+
+
+def material(number: int, params: NDArray[np.float64]) -> Material:
+    """A row of parameters as a material."""
+    values = {
+        name: float(params[columns][0])
+        if columns.stop - columns.start == 1
+        else tuple(params[columns].tolist())
+        for name, columns in nma.LAYERED3.slices.items()
+    }
+    return Material(f"validation-{number}", f"Validation material {number}", "", nma.LAYERED3.name, values)
+
+
+def render(bsdf: dict[str, Any], size: int, spp: int, seed: int) -> Images:
+    return render_passes(load_dict(nma.preview_scene(bsdf, size=(size, size))), spp, seed=seed)
+
+
+def compare(pictures: Images, references: Images) -> dict[str, float]:
+    """Means of all metrics over the materials."""
+    found = [nma.compare_images(a, b) for a, b in zip(pictures, references, strict=True)]
+    return {name: round(float(np.mean([f[name] for f in found])), 7) for name in METRICS}
+
+
+def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int = 4) -> None:
+    """Like the paper's Fig. 6: materials at even steps of the first variant's error, from the worst to the median."""
+    flips = {
+        name: [nma.compare_images(a, b)["flip_ldr"] for a, b in zip(images, gallery.reference, strict=True)]
+        for name, images in pictures.items()
+    }
+    worst_first = np.argsort(flips[next(iter(flips))])[::-1]
+    chosen = worst_first[np.unique(np.linspace(0, len(worst_first) // 2, rows).astype(int))]
+    lines = [
+        Row(
+            describe(gallery.materials[m]),
+            [gallery.reference[m], *(images[m] for images in pictures.values())],
+            ["", *(f"FLIP {flip[m]:.4f}" for flip in flips.values())],
+        )
+        for m in chosen
+    ]
+    title, note = (
+        "Variants on unseen materials",
+        f"LDR-FLIP; rows by that of {next(iter(flips))}, worst first",
+    )
+    contact_sheet(path, lines, ["reference", *pictures], title=title, note=note)
+
+
+def describe(material: Material) -> str:
+    """A material's widths, optical depth and index in a line."""
+    short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
+    return short.format(material.title, **material.values)

@@ -1,0 +1,123 @@
+"""Paper Fig. 3, Table 2, Fig. 6 and Table 3: the target's variants over the size of the dataset, and in pictures.
+
+    python figures/variants/run.py [--quick] [--data FOLDER.zarr] [--sizes N ...] [--seeds N] [--steps N]
+        [--only VARIANT ...] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
+
+Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md), and on the validation
+set itself for the bounds. Takes hours: adapters, their figures and pictures are kept in out/figures/variants, so a
+killed run goes on, and nothing is done twice. With --only, only those variants are trained, and everything that is
+there is reported. Writes variants.json, tables.md, variants.png and materials.png beside this file; with --quick, of
+a few small trainings, to out/figures/variants.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import jax
+import report
+from images import Gallery, View, sheet
+from train import ALL, INSTANCES, VARIANTS, Job, Store, first, plan
+
+import nma
+import nma.render
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+SET = "range"
+SETTINGS = ("sizes", "seeds", "steps", "materials", "resolution", "spp", "reference_spp")
+# What --quick takes instead: materials and walks of its dataset, and its other settings.
+QUICK_DATA = (16, 100_000)
+QUICK_VALIDATION = 2
+QUICK = {"sizes": [16], "seeds": 1, "steps": 20, "materials": 2, "resolution": 160, "spp": 8}
+
+
+def main() -> None:
+    arguments = parse()
+    quick = arguments.quick
+    folder, kept = common.results(__file__, quick), common.ROOT / "out/figures/variants"
+    kept = kept / "quick" if quick else kept
+    data = quick_dataset(kept / "data.zarr") if quick else arguments.data
+    validation = common.reference(SET, quick)
+    if quick:
+        # Compiling takes longer than these few steps.
+        jax.config.update("jax_disable_most_optimizations", True)
+        validation = first(validation, QUICK_VALIDATION)
+    name = f"{SET}-{len(validation.params)}x{int(validation.walks[0])}"
+    store = Store(kept, data, validation, name)
+    store.check(arguments.sizes)
+
+    jobs = plan(arguments.sizes, arguments.seeds, arguments.steps, [] if quick else list(INSTANCES))
+    done, results = {}, {}
+    for job in jobs:
+        adapter = store.train(job) if job.variant in arguments.only else store.adapter(job)
+        if adapter is not None:
+            done[job], results[job] = adapter, {"tables": store.log_losses(job, adapter)}
+    if not done:
+        sys.exit("nothing is trained yet")
+
+    nma.render.use()
+    view = View(arguments.materials, arguments.resolution, arguments.spp, arguments.reference_spp)
+    gallery = Gallery(store, view, name)
+    for job, adapter in done.items():
+        if job.size == max(arguments.sizes):
+            results[job]["images"] = gallery.metrics(job, adapter)
+    write(folder, results, gallery, arguments, done)
+
+
+def parse() -> argparse.Namespace:
+    parser = common.parser(__doc__)
+    parser.add_argument("--data", type=Path, default=common.ROOT / "out/layered3.zarr", help="a dataset")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[250, 1000, 8000], help="materials")
+    parser.add_argument("--seeds", type=int, default=3, help="how many trainings of each kind")
+    parser.add_argument("--steps", type=int, default=20_000, help="of each training")
+    parser.add_argument("--only", nargs="+", choices=list(ALL), default=list(ALL), help="train only these")
+    parser.add_argument("--materials", type=int, default=View().materials, help="to render")
+    parser.add_argument("--resolution", type=int, default=View().size, help="of the pictures, in pixels")
+    parser.add_argument("--spp", type=int, default=View().spp, help="samples per pixel of the adapters")
+    parser.add_argument("--reference-spp", type=int, default=View().reference_spp, help="of the simulation")
+    arguments = parser.parse_args()
+    if arguments.quick:
+        vars(arguments).update(QUICK, reference_spp=64)
+    return arguments
+
+
+def quick_dataset(path: Path) -> Path:
+    """A small dataset, simulated once."""
+    materials, walks = QUICK_DATA
+    nma.Dataset.create(path, nma.Settings("layered3", materials, walks, seed=2)).write()
+    return path
+
+
+def write(
+    folder: Path,
+    results: report.Results,
+    gallery: Gallery,
+    arguments: argparse.Namespace,
+    done: dict[Job, nma.Adapter],
+) -> None:
+    """Prints and writes tables, plot and pictures."""
+    floor = next(iter(results.values()))["tables"]["noise_floor"]
+    noise = gallery.noise()
+    found = report.summary(results, arguments.sizes)
+    tables = report.markdown(found, noise, floor)
+    print(tables)
+    (folder / "tables.md").write_text(tables)
+    settings = {key: getattr(arguments, key) for key in SETTINGS}
+    runs = [{**vars(job), **result} for job, result in results.items()]
+    common.write_json(folder / "variants.json", {"settings": settings, "noise": noise, **found, "runs": runs})
+    report.plot(found["log_loss"], floor, folder / "variants.png")
+    shown = {
+        job.variant: gallery.pictures(job, adapter)
+        for job, adapter in done.items()
+        if job.size == max(arguments.sizes) and job.seed == 0 and job.variant in VARIANTS
+    }
+    if shown:
+        sheet(gallery, shown, folder / "materials.png")
+
+
+if __name__ == "__main__":
+    main()
