@@ -191,7 +191,7 @@ def test_chi_square(material):
                 sample_dim=3,
                 sample_count=1 << 17,
                 res=51,
-                ires=8,
+                ires=32,  # with 8, the test's own integral of a narrow lobe is off by half a per cent
             )
             assert test.run(0.01, 3), (adapter, wi, test.messages)
 

@@ -114,7 +114,7 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
         random_adapter(hidden="2x8").save(tmp_path / "small.safetensors")
         bsdf = bsdf | {"adapter": str(tmp_path / "small.safetensors")}
     directions = {f"material.{key}": d for key, d in directions.items()}
-    derivatives, differences = slopes(scene(bsdf, depth=2, sky=0.0), directions, 0.002, spp=16, seeds=2)
+    derivatives, differences = slopes(scene(bsdf, depth=2, sky=0.0), directions, 0.001, spp=16, seeds=2)
     for key, expected in differences.items():
         np.testing.assert_allclose(derivatives[key], expected, rtol=0.01, err_msg=key)
         assert np.abs(expected).min() > 1e-4

@@ -254,7 +254,14 @@ def test_the_huber_loss_seeks_the_mean_of_noisy_bins_and_the_log_loss_their_medi
     """A matte target whose brightness is all there is to fit, against sparse bins of the same brightness."""
     rng, quantum = np.random.default_rng(6), 0.2
     base = replace(
-        TINY, encoding="direction", directional=False, points=1, rows=4000, bins_per_row=1, energy=0.0
+        TINY,
+        encoding="direction",
+        directional=False,
+        points=1,
+        rows=4000,
+        bins_per_row=1,
+        energy=0.0,
+        albedo=0.0,
     )
     base = replace(base, instances=1, points_law="centre")
     matte = Principled(Color(0.5, 0.5, 0.5), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
