@@ -84,7 +84,7 @@ def albedos(
 def _albedos(
     adapter: nma.Adapter, params: np.ndarray, mu: np.ndarray, samples: int, shift: float
 ) -> np.ndarray:
-    Float, UInt32 = dr.auto.Float, dr.auto.UInt32
+    Float, UInt32, Sum = dr.auto.Float, dr.auto.UInt32, dr.auto.Float64
     flat = target.numbers(adapter.prepare(list(params.T), mu), adapter.target)
     curves = [Float(np.broadcast_to(np.asarray(x, np.float32), len(mu)).copy()) for x in flat]
     cosines = Float(mu.astype(np.float32))
@@ -95,9 +95,11 @@ def _albedos(
     def body(k, *sums):
         u = [dr.gather(Float, x, k) for x in lattice]
         _, value, pdf = target.sample(blend, wi, *u)
-        return k + 1, *(s + dr.select(pdf > 0, c / pdf, 0.0) for s, c in zip(sums, value, strict=True))
+        weights = [Sum(dr.select(pdf > 0, c / pdf, 0.0)) for c in value]
+        return k + 1, *(s + w for s, w in zip(sums, weights, strict=True))
 
-    start = (dr.zeros(UInt32, len(mu)), *(dr.zeros(Float, len(mu)) for _ in range(3)))
+    # In single precision a million terms would be rounded the same way.
+    start = (dr.zeros(UInt32, len(mu)), *(dr.zeros(Sum, len(mu)) for _ in range(3)))
     sums = dr.while_loop(start, lambda k, *_: k < samples, body, mode="symbolic", label="albedo")[1:]
     return np.max([s.numpy() for s in sums], axis=0) / samples
 
