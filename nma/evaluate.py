@@ -41,14 +41,21 @@ class Evaluation:
 
 
 def tabulate_adapter(
-    adapter: Adapter, params: NDArray, *, shift: float = 0.0, clamp: bool = False, grid: Grid = ISOTROPIC
+    adapter: Adapter,
+    params: NDArray,
+    *,
+    shift: float = 0.0,
+    clamp: bool = False,
+    grid: Grid = ISOTROPIC,
+    directions: int | None = None,
 ) -> NDArray[np.float32]:
     """The adapter's bin averages (n, theta_i, theta_o, phi, 3). `shift` in [0, 1) selects another set of points.
 
+    With fewer `directions`, the cos(theta_i) in each row (32), it is faster and less exact in proportion.
     Raises `ParamError` for parameters outside of the training range, or moves them to it with `clamp`.
     """
     params = _known(adapter, params, clamp)
-    strata = np.arange(grid.theta_i * _DIRECTIONS)
+    strata = np.arange(grid.theta_i * (directions or _DIRECTIONS))
     jitter = (strata * 0.6180339887 + 0.31 + shift) % 1.0
     mu = ((strata + jitter) / len(strata)).astype(np.float32)
     return np.stack([_tabulate(adapter.numbers(p[None], mu)[0], mu, shift, adapter, grid) for p in params])
@@ -86,15 +93,16 @@ def _by_points(
 ) -> NDArray[np.float64]:
     """The part that is not sharp (bins, 3), averaged over points in every bin."""
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
+    directions = len(cosines) // grid.theta_i
     bins = dr.arange(UInt32, grid.bins)
     row = bins // (grid.theta_o * grid.phi_o)
     o = Float((bins // grid.phi_o) % grid.theta_o)
     p = Float(bins % grid.phi_o)
     shifts = [_uniform(bins * 2 + k, seed) for k in range(2)]
-    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(_DIRECTIONS * _POINTS).T[:2]]
+    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(directions * _POINTS).T[:2]]
 
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
-        at = row * _DIRECTIONS + k // _POINTS
+        at = row * directions + k // _POINTS
         mu = dr.gather(Float, cosines, at)
         blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
         u, v = (_shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
@@ -107,9 +115,9 @@ def _by_points(
     zero = dr.zeros(Float, grid.bins)
     state = (dr.zeros(UInt32, grid.bins), zero, zero, zero)
     sums = dr.while_loop(
-        state, lambda k, *_: k < _DIRECTIONS * _POINTS, body, mode="symbolic", label="bin averages"
+        state, lambda k, *_: k < directions * _POINTS, body, mode="symbolic", label="bin averages"
     )[1:]
-    return np.stack([s.numpy() for s in sums], axis=-1) / float(_DIRECTIONS * _POINTS)
+    return np.stack([s.numpy() for s in sums], axis=-1) / float(directions * _POINTS)
 
 
 def _by_samples(
@@ -125,11 +133,12 @@ def _by_samples(
     u = [_shifted(dr.gather(Float, x, k), _uniform(at * 3 + n, ~seed)) for n, x in enumerate(lattice)]
     wo, value, pdf = target.sample(blend, Vec3(ops.safe_sqrt(1.0 - mu * mu), 0.0 * mu, mu), *u)
     value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
-    index = bin_index(at // _DIRECTIONS, UInt32(0), wo, grid)
+    directions = len(cosines) // grid.theta_i
+    index = bin_index(at // directions, UInt32(0), wo, grid)
     dr.eval(index, value)
     # Summed by NumPy, in a fixed order.
     sums = [np.bincount(index.numpy(), c.numpy(), grid.bins) for c in value]
-    return np.stack(sums, axis=-1) / (_DIRECTIONS * _SAMPLES * grid.solid_angle)
+    return np.stack(sums, axis=-1) / (directions * _SAMPLES * grid.solid_angle)
 
 
 def _sharpness(pdf: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 
 import nma
 from nma.errors import NmaError
+from nma.metrics import mean_metrics, table_metrics
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
 
@@ -121,8 +122,13 @@ class Store:
         """The figures of an adapter on the validation set, from the cache if they are there."""
 
         def measure() -> dict[str, float]:
-            evaluation = nma.evaluate_adapter(adapter, self.validation)
-            return {name: round(value, 7) for name, value in evaluation.mean.items()}
+            # A quarter of the points of `nma.evaluate_adapter`: .00003 more than it finds, in all variants.
+            wanted = self.validation
+            found = [
+                table_metrics(nma.tabulate_adapter(adapter, params[None], directions=16)[0], table, error)
+                for params, table, error in zip(wanted.params, wanted.values, wanted.error, strict=True)
+            ]
+            return {name: round(value, 7) for name, value in mean_metrics(found).items()}
 
         return self.cached(job, "tables", {"validation": self._name}, adapter, measure)
 

@@ -17,10 +17,14 @@ import numpy as np
 import optax
 
 from nma.errors import NmaError
-from nma.network import Layers
 from nma.train.data import Batch, batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
+
+# What is trained: any tree of arrays, for an adapter `nma.network.Layers`.
+Weights = Any
+# (weights, batch, recipe) -> (what is minimised, the log loss that is reported).
+Objective = Callable[[Weights, Batch, Recipe], tuple[jax.Array, jax.Array]]
 
 # Steps per call of the compiled function.
 GROUP = 50
@@ -33,8 +37,8 @@ _MIN_SCALE = 1e-3
 class State(NamedTuple):
     """All that a step changes."""
 
-    layers: Layers
-    averaged: Layers
+    layers: Weights
+    averaged: Weights
     optimiser: Any
 
 
@@ -51,9 +55,9 @@ class Run:
     record: dict[str, Any] = field(default_factory=dict)
 
 
-def start(recipe: Recipe, layers: Layers, record: dict[str, Any] | None = None) -> Run:
+def start(recipe: Recipe, layers: Weights, record: dict[str, Any] | None = None) -> Run:
     """A run that has not done any step; `record` says where its data come from."""
-    layers = [(jnp.asarray(m, jnp.float32), jnp.asarray(b, jnp.float32)) for m, b in layers]
+    layers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), layers)
     return Run(State(layers, layers, _optimiser(recipe).init(layers)), record=record or {})
 
 
@@ -62,19 +66,20 @@ def train(
     run: Run,
     source: Callable[[int], Batch],
     *,
+    objective: Objective = loss,
     checkpoint: Path | None = None,
     progress: Callable[[Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> Run:
     """Continues `run` to the recipe's last step, or until the time budget is spent; returns it.
 
-    `source(step)` gives a step's batch and must depend on nothing but the step. With `checkpoint`, progress is written
-    there every minute and at the end.
+    `source(step)` gives a step's batch and must depend on nothing but the step. What `objective` returns first is
+    minimised. With `checkpoint`, progress is written there every minute and at the end.
     """
     saved = began = time.perf_counter()
     before = run.seconds
     for _first, group in batches(source, run.step, recipe.steps, GROUP):
-        run.state, values = _group(run.state, group, run.scale, recipe)
+        run.state, values = _group(run.state, group, run.scale, recipe, objective)
         values = np.asarray(values)
         if not np.isfinite(values).all():
             raise NmaError(
@@ -99,10 +104,9 @@ def train(
     return run
 
 
-def result(run: Run, recipe: Recipe) -> Layers:
-    """The trained layers as NumPy arrays: the averaged ones where the recipe averages."""
-    layers = run.state.averaged if recipe.average > 0 else run.state.layers
-    return [(np.asarray(m), np.asarray(b)) for m, b in layers]
+def result(run: Run, recipe: Recipe) -> Weights:
+    """The trained weights as NumPy arrays: the averaged ones where the recipe averages."""
+    return jax.tree.map(np.asarray, run.state.averaged if recipe.average > 0 else run.state.layers)
 
 
 def _schedule(recipe: Recipe) -> optax.Schedule:
@@ -117,13 +121,15 @@ def _optimiser(recipe: Recipe) -> optax.GradientTransformation:
     return optax.adam(_schedule(recipe))
 
 
-@partial(jax.jit, static_argnames="recipe")
-def _group(state: State, group: Batch, scale: float, recipe: Recipe) -> tuple[State, jax.Array]:
+@partial(jax.jit, static_argnames=("recipe", "objective"))
+def _group(
+    state: State, group: Batch, scale: float, recipe: Recipe, objective: Objective
+) -> tuple[State, jax.Array]:
     """The steps of one group: the new state and (loss, log loss) of each step."""
     optimiser = _optimiser(recipe)
 
     def step(state: State, batch: Batch) -> tuple[State, jax.Array]:
-        (value, log_loss), gradient = jax.value_and_grad(loss, has_aux=True)(state.layers, batch, recipe)
+        (value, log_loss), gradient = jax.value_and_grad(objective, has_aux=True)(state.layers, batch, recipe)
         updates, inner = optimiser.update(gradient, state.optimiser)
         layers = optax.apply_updates(state.layers, jax.tree.map(lambda u: u * scale, updates))
         averaged = optax.incremental_update(layers, state.averaged, 1.0 - recipe.average)
@@ -158,7 +164,7 @@ def save(run: Run, recipe: Recipe, path: Path) -> None:
     partial_path.replace(path)
 
 
-def resume(recipe: Recipe, layers: Layers, path: Path, record: dict[str, Any] | None = None) -> Run:
+def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] | None = None) -> Run:
     """The run stored in a checkpoint, or a new one if there is none. Another recipe, or other data, are refused."""
     run = start(recipe, layers, record)
     if not path.exists():

@@ -64,7 +64,16 @@ def albedos(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:
 def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
     """(what is minimised, the log loss of eq. 7 against the noisy tables)."""
     blend = blend_of(layers, batch, recipe)
-    mean = bin_means(blend, batch, recipe)
+    total, log_loss = distance(bin_means(blend, batch, recipe), batch, recipe)
+    if recipe.albedo > 0:
+        # The product of two independent errors has the squared error as its mean, without the estimate's variance.
+        first, second = albedos(blend, batch, recipe) - batch.albedo
+        total = total + recipe.albedo * (first * second).mean()
+    return total, log_loss
+
+
+def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """(recipe's distance, log loss) of a model's bin means (3, bins_per_row, rows) from the tables."""
     residual = jnp.log1p(mean) - jnp.log1p(batch.value)
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":
@@ -77,9 +86,4 @@ def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.A
     huber = jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)
     # An error d of the logarithm is an error (1 + value) d of the value itself.
     emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
-    total = (huber * emphasis * batch.weight).mean()
-    if recipe.albedo > 0:
-        # The product of two independent errors has the squared error as its mean, without the estimate's variance.
-        first, second = albedos(blend, batch, recipe) - batch.albedo
-        total = total + recipe.albedo * (first * second).mean()
-    return total, log_loss
+    return (huber * emphasis * batch.weight).mean(), log_loss

@@ -1,0 +1,132 @@
+"""A network that evaluates f cos(theta_o) itself: a latent per material, and a decoder of about a million weights.
+
+It has the latent size and about the decoder size of Fan et al. 2022, "Neural Layered BRDFs", as the paper states them;
+everything else is ours, as their weights and data are not to be had. To be a fair opponent it sees half-vector
+coordinates (Rusinkiewicz 1998), in which highlights are simple, and learns with the adapter's data, loss and optimiser.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+import nma
+from nma import ava, network, ops
+from nma.network import Layers
+from nma.ops import Vec3
+from nma.train import loop
+from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.loss import distance
+from nma.train.recipe import Recipe, preset
+
+LATENT = 32
+FEATURES = 6
+# log(1 + f cos) starts about here.
+_INITIAL = 0.05
+# The sine of the half vector's angle, below which highlights look alike.
+_SHARPEST = 1e-3
+
+
+class Evaluator(NamedTuple):
+    """What is trained: latents (materials, LATENT), and the decoder from latent and directions to log(1 + f cos)."""
+
+    latents: Any
+    decoder: Layers
+
+
+def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
+    """The adapter's recipe where it applies: data, bins, loss, schedule, averaging."""
+    return preset(
+        "class",
+        network=network_name,
+        rows=256,
+        albedo=0.0,
+        points=1,
+        points_law="uniform",
+        learning_rate=1e-3,
+        steps=steps,
+        seed=seed,
+    )
+
+
+def start(materials: int, how: Recipe) -> Evaluator:
+    """Random latents and layers."""
+    rng = np.random.default_rng((how.seed, 0xD1EC7))
+    sizes = [LATENT + FEATURES, *network.hidden(how.network), 3]
+    bias = np.full(3, np.log(np.expm1(_INITIAL)))
+    return Evaluator(latents(materials, how), network.init(rng, sizes, bias))
+
+
+def latents(materials: int, how: Recipe) -> NDArray[np.float32]:
+    rng = np.random.default_rng((how.seed, 0x1A7E))
+    return 0.1 * rng.standard_normal((materials, LATENT), dtype=np.float32)
+
+
+def evaluate(decoder: Layers, latent: Any, wi: Vec3, wo: Vec3) -> Any:
+    """f cos(theta_o) [1/sr], (..., 3), on JAX; `latent` (..., LATENT)."""
+    seen = jnp.stack(_features(wi, wo), axis=-1)
+    latent = jnp.broadcast_to(latent, (*seen.shape[:-1], LATENT))
+    return jnp.expm1(jax.nn.softplus(network.forward(decoder, jnp.concatenate([latent, seen], axis=-1))))
+
+
+def _features(wi: Vec3, wo: Vec3) -> list[Any]:
+    """Cosines of wi, wo, half and difference angle, the half angle's logarithm, the azimuth's cosine; about -1..1."""
+    half = ops.normalize(wi + wo)
+    sine = ops.safe_sqrt(half.x * half.x + half.y * half.y)
+    narrow = ops.log(sine + _SHARPEST) / np.log(_SHARPEST)
+    flat = ops.safe_sqrt((1.0 - wi.z * wi.z) * (1.0 - wo.z * wo.z)) + 1e-6
+    azimuth = (wi.x * wo.x + wi.y * wo.y) / flat
+    found = (wi.z, wo.z, half.z, ops.dot(wi, half), narrow)
+    return [*(2.0 * x - 1.0 for x in found), azimuth]
+
+
+def train(
+    tables: nma.Tables,
+    how: Recipe,
+    record: dict[str, Any],
+    checkpoint: Path,
+    progress: Callable[[loop.Run], None],
+    decoder: Layers | None = None,
+) -> tuple[Evaluator, loop.Run]:
+    """Latents of some materials, with the decoder or for a given one; goes on from the checkpoint."""
+    fresh = start(len(tables.params), how)
+    begin = fresh if decoder is None else fresh._replace(decoder=decoder)
+    run = loop.resume(how, begin, checkpoint, record)
+    pool, sampler = _numbered(tables), BinSampler(how.bins_law)
+    objective = _objective if decoder is None else _latents_alone
+    loop.train(
+        how,
+        run,
+        lambda step: draw(pool, sampler, how, step),
+        objective=objective,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+    return loop.result(run, how), run
+
+
+def _numbered(tables: nma.Tables) -> Pool:
+    """A pool whose materials have their number for a parameter, to find their latents by."""
+    numbers = np.arange(len(tables.params), dtype=np.float64)[:, None]
+    return Pool.of(replace(tables, params=numbers))
+
+
+def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The adapter's distance, with one random point in each bin for its mean."""
+    points = ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(batch.shift))
+    latent = evaluator.latents[batch.columns[0].astype(jnp.int32)]
+    wi = Vec3(*(jnp.broadcast_to(x, points.wo.z.shape) for x in points.wi))
+    value = evaluate(evaluator.decoder, latent, wi, points.wo)
+    return distance(jnp.moveaxis(value, -1, 0), batch, how)
+
+
+def _latents_alone(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The same for a decoder that stays as it is."""
+    return _objective(evaluator._replace(decoder=jax.lax.stop_gradient(evaluator.decoder)), batch, how)

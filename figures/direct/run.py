@@ -1,0 +1,254 @@
+"""Paper Table 5 and Fig. 11: the adapters beside a network of a million weights that evaluates f itself.
+
+    python figures/direct/run.py [--quick] [--data FOLDER.zarr] [--steps N] [--latent-steps N]
+
+Trains a latent per material and a decoder (evaluator.py) on the adapters' dataset, then latents of the 89 validation
+materials on their own references, as the paper does for Fan et al. 2022; the adapters see their parameters alone. Both
+are judged by the mean of random points in every bin. The trainings go on from checkpoints in out/figures/direct.
+Writes direct.json, direct.md and direct.png beside this file; with --quick, of a small network, to out/figures/direct.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import evaluator as direct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+import nma
+from nma import ava, encoding, network, target
+from nma.cli import console
+from nma.dataset import Settings, simulate_block
+from nma.metrics import mean_metrics, table_metrics
+from nma.ops import Vec3
+from nma.table import ISOTROPIC
+from nma.train.loop import Run
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+SET = "range"
+NETWORK, QUICK_NETWORK = "5x512", "2x32"
+# Points per bin, as in the paper. The direct evaluator gets fewer: it is slow, and smooth within a bin.
+POINTS, DIRECT_POINTS = 10, 2
+# Points that are evaluated at a time.
+BATCH = 8192
+# The paper's 40 x 80 x 40 x 80 bins; of an isotropic material, ours hold all of their values.
+PAPER_POINTS = 40 * 80 * 40 * 80 * 10
+COLUMNS = {
+    "ae": "AE",
+    "psnr": "PSNR",
+    "smape": "SMAPE",
+    "log_loss": "log loss",
+    "albedo_error": "albedo error",
+}
+# Table 5 (an RTX 4090).
+PAPER = {
+    "paper: NMA 5x64": {"ae": 0.0065, "psnr": 45.5, "smape": 0.100, "log_loss": 0.0037, "seconds": 3.76},
+    "paper: Fan et al.": {"ae": 0.0130, "psnr": 39.7, "smape": 0.257, "log_loss": 0.0100, "seconds": 99.78},
+}
+# From points (n,) to f cos(theta_o) (n, 3) of the material with this number.
+Evaluate = Callable[[int, Vec3, Vec3], NDArray]
+
+
+def main() -> None:
+    parser = common.parser(__doc__)
+    parser.add_argument("--data", type=Path, default=common.ROOT / "out/layered3.zarr", help="a dataset")
+    parser.add_argument("--steps", type=int, default=6000, help="of the direct evaluator's training")
+    parser.add_argument(
+        "--latent-steps", type=int, default=1500, help="for the validation materials' latents"
+    )
+    arguments = parser.parse_args()
+    if arguments.quick:
+        vars(arguments).update(steps=50, latent_steps=50)
+    folder = common.results(__file__, arguments.quick)
+    reference = common.reference(SET, arguments.quick)
+    trained, how = train(arguments, reference)
+    results = {}
+    for name in nma.shipped():
+        adapter = nma.Adapter.load(name)
+        evaluate = of_adapter(adapter, reference.params)
+        results[name] = judge(evaluate, reference, POINTS)
+        results[name] |= {
+            "exact": exact(adapter, reference),
+            "parameters": network.parameters(adapter.layers),
+        }
+        print_means(name, results[name])
+    label = "direct evaluator"
+    results[label] = judge(of_evaluator(trained), reference, DIRECT_POINTS)
+    results[label] |= {"parameters": network.parameters(trained.decoder), **how}
+    print_means(label, results[label])
+    text = markdown(results, floor(reference))
+    print(text)
+    (folder / "direct.md").write_text(text)
+    common.write_json(folder / "direct.json", results)
+    plot(results, folder / "direct.png")
+
+
+def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict[str, Any]]:
+    """The evaluator with latents of the validation materials, and what its training took."""
+    quick, kept = arguments.quick, common.ROOT / "out/figures/direct"
+    kept.mkdir(parents=True, exist_ok=True)
+    settings, tables = data(arguments.data, quick)
+    how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
+    # The validation set decides nothing about the decoder.
+    stem, record = f"{how.network}_{settings.materials}_{how.steps}-steps", {"dataset": asdict(settings)}
+    with Bar("decoder", how.steps) as bar:
+        whole, run = direct.train(tables, how, record, kept / f"{stem}.ckpt", bar.update)
+    again = direct.recipe(arguments.latent_steps, how.network)
+    record |= {"decoder": how.steps, "validation": f"{SET}-{len(reference.params)}"}
+    path = kept / f"{stem}_{again.steps}-latent-steps.ckpt"
+    with Bar("latents", again.steps) as bar:
+        fitted, fit = direct.train(reference, again, record, path, bar.update, whole.decoder)
+    took = {"bins_seen": how.steps * how.bins_per_step, "training_seconds": round(run.seconds)}
+    return fitted, took | {"latent_seconds_per_material": round(fit.seconds / len(reference.params), 2)}
+
+
+def data(path: Path, quick: bool) -> tuple[Settings, nma.Tables]:
+    if quick:
+        settings = Settings("layered3", 16, 81_920, 0)
+        return settings, simulate_block(settings, range(16))
+    dataset = nma.Dataset.open(path)
+    return dataset.settings, dataset.load()
+
+
+class Bar:
+    """A progress bar with steps per second and the log loss."""
+
+    def __init__(self, title: str, steps: int):
+        self._bar = console.progress("steps/s")
+        self._task = self._bar.add_task(title, total=steps, rate="", note="")
+
+    def __enter__(self) -> Bar:
+        self._bar.__enter__()
+        return self
+
+    def __exit__(self, *args: Any) -> None:
+        self._bar.__exit__(*args)
+
+    def update(self, run: Run) -> None:
+        note = f"log loss {np.mean(run.log_losses[-200:]):.5f}"
+        self._bar.update(self._task, completed=run.step, rate=f"{run.step / run.seconds:.1f}", note=note)
+
+
+def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
+    """The adapter, its network run at every point like the paper's."""
+    encode, materials = encoding.get(adapter.encoding), params.astype(np.float32)
+
+    def at_points(material: jax.Array, wi: Vec3, wo: Vec3) -> jax.Array:
+        inputs = [jnp.broadcast_to(x, wi.z.shape) for x in encode(list(material), wi.z)]
+        raw = network.forward(adapter.layers, jnp.stack(inputs, axis=-1))
+        return jnp.stack(target.eval(adapter.decode(list(raw.T), wi.z), wi, wo), axis=-1)
+
+    run = batched(at_points)
+    return lambda number, wi, wo: run(materials[number], wi, wo)
+
+
+def of_evaluator(trained: direct.Evaluator) -> Evaluate:
+    run = batched(lambda latent, wi, wo: direct.evaluate(trained.decoder, latent, wi, wo))
+    return lambda number, wi, wo: run(trained.latents[number], wi, wo)
+
+
+def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any, Vec3, Vec3], NDArray]:
+    """The function, compiled, on batches that fit the cache of a CPU."""
+
+    @jax.jit
+    def compiled(material: Any, wi: Vec3, wo: Vec3) -> jax.Array:
+        return jax.lax.map(lambda pair: at_points(material, *pair), (wi, wo))
+
+    def run(material: Any, wi: Vec3, wo: Vec3) -> NDArray:
+        size = wi.z.size
+        length = -(-size // BATCH) * BATCH
+        wi, wo = (Vec3(*(np.resize(x, length).reshape(-1, BATCH) for x in v)) for v in (wi, wo))
+        return np.asarray(compiled(material, wi, wo)).reshape(-1, 3)[:size]
+
+    return run
+
+
+def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, Any]:
+    """Figures of every material with their means, and seconds for as many points as the paper has."""
+    bins = np.stack(np.unravel_index(np.arange(ISOTROPIC.bins), ISOTROPIC.shape[:3])).astype(np.float32)
+    materials, seconds = [], []
+    for number, table in enumerate(reference.values):
+        u = np.random.default_rng((0x7AB1E5, number)).random((3, per_bin, ISOTROPIC.bins), np.float32)
+        points = ava.uniform_bin_points(*bins, tuple(u))
+        wi = Vec3(*(np.broadcast_to(x, points.wo.z.shape) for x in points.wi))
+        began = time.perf_counter()
+        value = evaluate(number, wi, points.wo)
+        seconds.append((time.perf_counter() - began) / points.wo.z.size)
+        mean = value.reshape(per_bin, *ISOTROPIC.shape).mean(axis=0)
+        materials.append(table_metrics(mean, table, reference.error[number]))
+    rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
+    means = {k: round(v, 6) for k, v in mean_metrics(materials).items()}
+    # The median leaves out the first material, which waits for the compiler.
+    return {
+        "mean": means,
+        "seconds": round(float(np.median(seconds)) * PAPER_POINTS, 2),
+        "materials": rounded,
+    }
+
+
+def exact(adapter: nma.Adapter, reference: nma.Tables) -> dict[str, float]:
+    """Mean figures of the adapter's converged bin means, to tell its own error from that of few points per bin."""
+    found = [
+        table_metrics(nma.tabulate_adapter(adapter, params[None])[0], table, error)
+        for params, table, error in zip(reference.params, reference.values, reference.error, strict=True)
+    ]
+    return {k: round(v, 6) for k, v in mean_metrics(found).items()}
+
+
+def floor(reference: nma.Tables) -> float:
+    """The log loss of a perfect model."""
+    found = [
+        table_metrics(table, table, error)["noise_floor"]
+        for table, error in zip(reference.values, reference.error, strict=True)
+    ]
+    return float(np.mean(found))
+
+
+def print_means(name: str, result: dict[str, Any]) -> None:
+    print(name, {k: result["mean"][k] for k in COLUMNS}, f"{result['seconds']} s", flush=True)
+
+
+def markdown(results: dict[str, Any], noise: float) -> str:
+    """Table 5 with the paper's rows."""
+    lines = ["| | " + " | ".join(COLUMNS.values()) + " | time, s | parameters |", "|---" * 8 + "|"]
+    for name, result in results.items():
+        cells = [f"{result['mean'][k]:.4g}" for k in COLUMNS]
+        cells += [f"{result['seconds']:.4g}", f"{result['parameters']:,}"]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        if "exact" in result:
+            cells = [f"{result['exact'][k]:.4g}" for k in COLUMNS]
+            lines.append(f"| {name}, converged bin means | " + " | ".join(cells) + " | | |")
+    for name, row in PAPER.items():
+        cells = [f"{row[k]:.4g}" if k in row else "" for k in COLUMNS]
+        lines.append(f"| {name} | " + " | ".join([*cells, f"{row['seconds']:.4g}", ""]) + " |")
+    return "\n".join(lines) + f"\n\nNoise of the references: {noise:.5f} in log loss.\n"
+
+
+def plot(results: dict[str, Any], path: Path) -> None:
+    """Fig. 11: absolute error and log loss of every material, in the order of the first adapter's."""
+    figure = Figure(figsize=(10, 5.5), layout="constrained")
+    order = np.argsort([m["ae"] for m in next(iter(results.values()))["materials"]])
+    for axes, quantity in zip(figure.subplots(2, 1, sharex=True), ("ae", "log_loss"), strict=True):
+        for name, result in results.items():
+            values = np.array([m[quantity] for m in result["materials"]])
+            axes.plot(values[order], marker=".", linewidth=0.8, label=f"{name}: {values.mean():.4f}")
+        axes.set(yscale="log", ylabel="absolute error [1/sr]" if quantity == "ae" else "log loss (eq. 7)")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    figure.axes[-1].set_xlabel("validation materials, by the first adapter's absolute error")
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
