@@ -65,18 +65,20 @@ def contact_sheet(
     below = top + len(rows) * row_height
     note_top = below + _table_height(table) + (GAP if table else 0)
     bottom = note_top + (len(note.split("\n")) * _line(CAPTION_SIZE) if note else 0) + MARGIN
-    grid_width = len(columns) * (width + GAP) - GAP
-    words = max(_width(title, TITLE_SIZE, bold=True), _width(note, CAPTION_SIZE), _table_width(table))
+    cell = _cell_width(width, rows, columns)
+    grid_width = len(columns) * (cell + GAP) - GAP
+    labels = max(_width(row.label, TEXT_SIZE) for row in rows)
+    words = max(_width(title, TITLE_SIZE, bold=True), _width(note, CAPTION_SIZE), _table_width(table), labels)
     content = max(grid_width, words)
 
     sheet = Image.new("RGB", (content + 2 * MARGIN, bottom), PAPER)
     draw = ImageDraw.Draw(sheet)
     _text(draw, (MARGIN, MARGIN), title, TITLE_SIZE, bold=True)
     for index, name in enumerate(columns):
-        middle = MARGIN + index * (width + GAP) + width / 2
+        middle = MARGIN + index * (cell + GAP) + max(width, _width(name, TEXT_SIZE, bold=True)) / 2
         _text(draw, (middle, head), name, TEXT_SIZE, bold=True, anchor="ma")
     for index, (row, images) in enumerate(zip(rows, pictures, strict=True)):
-        _draw_row(sheet, top + index * row_height, row, images)
+        _draw_row(sheet, top + index * row_height, row, images, cell)
     _draw_table(draw, below, table)
     _text(draw, (MARGIN, note_top), note, CAPTION_SIZE, colour=QUIET)
     pixels = np.asarray(sheet)
@@ -109,13 +111,20 @@ def _common_size(pictures: list[list[NDArray[np.uint8]]], columns: Sequence[str]
     return sizes.pop()
 
 
-def _draw_row(sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]]) -> None:
+def _cell_width(width: int, rows: Sequence[Row], columns: Sequence[str]) -> int:
+    """Room for a picture, its heading and its caption."""
+    headings = [_width(name, TEXT_SIZE, bold=True) for name in columns]
+    captions = [_width(text, CAPTION_SIZE) for row in rows for text in row.captions]
+    return max(width, *headings, *captions)
+
+
+def _draw_row(sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]], cell: int) -> None:
     """The row's label, its images side by side, and a caption under each."""
     draw = ImageDraw.Draw(sheet)
     _text(draw, (MARGIN, top), row.label, TEXT_SIZE)
     top += _line(TEXT_SIZE) + 4
     for index, image in enumerate(images):
-        left = MARGIN + index * (image.shape[1] + GAP)
+        left = MARGIN + index * (cell + GAP)
         sheet.paste(Image.fromarray(image), (left, int(top)))
         if index < len(row.captions):
             _text(draw, (left, top + image.shape[0] + 4), row.captions[index], CAPTION_SIZE, colour=QUIET)

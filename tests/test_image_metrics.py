@@ -174,6 +174,14 @@ def test_contact_sheet_shows_the_pictures(tmp_path: Path, picture):
     assert found == 4
 
 
+def test_words_wider_than_a_picture_make_room(tmp_path: Path, picture):
+    short = [Row("r", [picture, picture], ["", ""])]
+    long = [Row("r", [picture, picture], ["a caption as long as this one", ""])]
+    narrow, wide = (contact_sheet(tmp_path / "a.png", rows, ["a", "b"]) for rows in (short, long))
+    heading = contact_sheet(tmp_path / "a.png", short, ["a heading that is as long as this one", "b"])
+    assert narrow.shape[1] < wide.shape[1] < heading.shape[1]
+
+
 @pytest.mark.parametrize("fault", ["empty", "count", "size"])
 def test_contact_sheet_refuses(fault, tmp_path: Path, picture):
     rows = {

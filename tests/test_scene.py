@@ -251,3 +251,9 @@ def test_ztest_refuses(fault):
 
 def render(scene: dict, spp: int) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=0))
+
+
+def test_without_a_variant_it_says_what_to_call(monkeypatch):
+    monkeypatch.setattr(mi, "variant", lambda: None)
+    with pytest.raises(ParamError, match=r"nma\.render\.use\(\)"):
+        preview_scene(GREY)

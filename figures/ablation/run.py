@@ -32,6 +32,7 @@ CHANGES = {
     "not bounded": {"bounded": False},
     "stretched": {"target": "stretched"},
     "uniform points": {"points_law": "uniform"},
+    "points down to .002": {"finest": 0.002},
     "uniform bins": {"bins_law": "uniform"},
     "log loss": {"loss": "log"},
     "no energy": {"energy": 0.0},

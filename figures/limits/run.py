@@ -15,6 +15,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -42,6 +43,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.quick:
         vars(arguments).update(materials=2, steps=100)
+        # Compiling takes longer than these few steps.
+        jax.config.update("jax_disable_most_optimizations", True)
     folder = common.results(__file__, arguments.quick)
     reference = common.reference(SET, arguments.quick)
     adapters = [nma.Adapter.load(name) for name in nma.shipped()[::-1]]

@@ -16,19 +16,23 @@ from nma.image_metrics import METRICS
 from nma.materials import Material
 from nma.render.load import load_dict, material_bsdf
 from nma.render.progressive import render_passes
+from nma.render.scene import LAMP_RADIANCE
 
 Images = NDArray[np.float32]
 # Seeds of the renderings: the references' own, and that of the second one, which shows what noise alone scores.
 REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
 
+# The soft box's side in those of the scene's lamp.
+SOFT_BOX = 7
+
 
 class View(NamedTuple):
     """How materials are rendered: the first `materials` of the validation set, at `size` x `size` pixels."""
 
-    materials: int = 24
-    size: int = 160
-    spp: int = 256
-    reference_spp: int = 2048
+    materials: int = 89
+    size: int = 128
+    spp: int = 192
+    reference_spp: int = 512
 
 
 class Gallery:
@@ -98,7 +102,17 @@ def material(number: int, params: NDArray[np.float64]) -> Material:
 
 
 def render(bsdf: dict[str, Any], size: int, spp: int, seed: int) -> Images:
-    return render_passes(load_dict(nma.preview_scene(bsdf, size=(size, size))), spp, seed=seed)
+    return render_passes(load_dict(studio(bsdf, size)), spp, seed=seed)
+
+
+def studio(bsdf: dict[str, Any], size: int) -> dict[str, Any]:
+    """The preview scene under a sky without a sun and a soft box in place of the lamp, with one bounce of light: the
+    noise of small lights and caustics would hide what tells the variants apart."""
+    scene = nma.preview_scene(bsdf, size=(size, size), hide_sun=True, max_depth=3)
+    scene["lamp"]["to_world"] = scene["lamp"]["to_world"].scale(SOFT_BOX)
+    radiance = [value / SOFT_BOX**2 for value in LAMP_RADIANCE]
+    scene["lamp"]["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    return scene
 
 
 def compare(pictures: Images, references: Images) -> dict[str, float]:

@@ -78,8 +78,13 @@ def preview_scene(
         A new dictionary; nothing in it is shared with other calls.
 
     Raises:
-        ParamError: an unknown camera, a size or spp that is not positive, a missing environment map.
+        ParamError: an unknown camera, a size or spp that is not positive, a missing environment map, no variant of
+            Mitsuba in use.
     """
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        raise ParamError("preview_scene needs a variant of Mitsuba; call nma.render.use() first")
     width, height = size
     if min(width, height, spp) < 1:
         raise ParamError(f"preview_scene: size {size} and spp {spp} must be at least 1")
