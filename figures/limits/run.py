@@ -3,8 +3,8 @@
     python figures/limits/run.py [--quick] [--materials N]
 
 A fit knows its material, so what it leaves is the target's error; what a class adapter leaves beyond a fit of its own
-target is the network's, the data's and the optimiser's. Materials are evenly spaced in the set "range" by the log loss
-of the first shipped adapter; each is fitted to its reference and judged by it. Fits are kept in out/figures/limits.
+target is the network's, the data's and the optimiser's. Each of the first materials of the set "range", which is in
+random order, is fitted to its reference and judged by it. Finished ones are kept in out/figures/limits.
 Writes limits.json and limits.png beside this file; with --quick, short fits to two materials, to out/figures/limits.
 """
 
@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import json
 import sys
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -43,21 +43,14 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.quick:
         vars(arguments).update(materials=2, steps=100)
-        # Compiling takes longer than these few steps.
-        jax.config.update("jax_disable_most_optimizations", True)
     folder = common.results(__file__, arguments.quick)
     reference = common.reference(SET, arguments.quick)
-    adapters = [nma.Adapter.load(name) for name in nma.shipped()[::-1]]
-    rows = [class_adapters(adapters, reference, number) for number in range(len(reference.params))]
-    order = np.argsort([row[nma.shipped()[-1]]["log_loss"] for row in rows])
-    chosen = order[np.linspace(0, len(order) - 1, arguments.materials).round().astype(int)]
-    for number in chosen:
-        rows[number] |= fits(reference, int(number), arguments.steps, arguments.quick)
-        print(number, {k: v["log_loss"] for k, v in rows[number].items() if k != "params"}, flush=True)
-    result = summary([rows[n] for n in chosen])
+    rows = [contenders(reference, number, arguments) for number in range(arguments.materials)]
+    rows.sort(key=lambda row: row[nma.shipped()[-1]]["log_loss"])
+    result = summary(rows)
     print(json.dumps(result, indent=1))
-    common.write_json(folder / "limits.json", {"mean": result, "materials": [rows[n] for n in chosen]})
-    plot([rows[n] for n in chosen], folder / "limits.png")
+    common.write_json(folder / "limits.json", {"mean": result, "materials": rows})
+    plot(rows, folder / "limits.png")
 
 
 def one(reference: nma.Tables, number: int) -> nma.Tables:
@@ -68,23 +61,20 @@ def one(reference: nma.Tables, number: int) -> nma.Tables:
     return replace(reference, **kept)
 
 
-def class_adapters(adapters: list[nma.Adapter], reference: nma.Tables, number: int) -> dict:
-    """What the reference's noise and the shipped adapters score on a material."""
-    row: dict = {"params": [round(float(x), 5) for x in reference.params[number]]}
-    for name, adapter in zip(nma.shipped()[::-1], adapters, strict=True):
-        row[name], floor = figures(adapter, one(reference, number))
-    return row | {"noise": floor}
-
-
-def fits(reference: nma.Tables, number: int, steps: int, quick: bool) -> dict:
-    """What each target scores that is fitted to the material."""
-    kept = common.ROOT / "out/figures/limits" / f"{number}-{len(reference.params)}-{steps}.json"
-    if not kept.exists() or quick:
+def contenders(reference: nma.Tables, number: int, arguments: Namespace) -> dict:
+    """Figures of the shipped adapters, of fits of all targets, and of the reference's noise, for a material."""
+    stored = common.ROOT / "out/figures/limits" / f"{number}-{len(reference.params)}-{arguments.steps}.json"
+    if not stored.exists() or arguments.quick:
         table = one(reference, number)
-        found = {name: fit(table, preset("single", steps=steps, **how)) for name, how in TARGETS.items()}
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_text(json.dumps(found))
-    return json.loads(kept.read_text())
+        row: dict = {"params": [round(float(x), 5) for x in table.params[0]]}
+        for name in nma.shipped()[::-1]:
+            row[name], row["noise"] = figures(nma.Adapter.load(name), table)
+        for name in list(TARGETS)[: 1 if arguments.quick else None]:
+            row[name] = fit(table, preset("single", steps=arguments.steps, **TARGETS[name]))
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        stored.write_text(json.dumps(row))
+        print(number, {k: v["log_loss"] for k, v in row.items() if k != "params"}, flush=True)
+    return json.loads(stored.read_text())
 
 
 def fit(table: nma.Tables, recipe: Recipe) -> dict[str, float]:

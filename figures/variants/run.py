@@ -73,7 +73,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--data", type=Path, default=common.ROOT / "out/layered3.zarr", help="a dataset")
     parser.add_argument("--sizes", type=int, nargs="+", default=[250, 1000, 8000], help="materials")
     parser.add_argument("--seeds", type=int, default=3, help="how many trainings of each kind")
-    parser.add_argument("--steps", type=int, default=20_000, help="of each training")
+    parser.add_argument("--steps", type=int, default=6_000, help="of each training")
     parser.add_argument("--only", nargs="+", choices=list(ALL), default=list(ALL), help="train only these")
     parser.add_argument("--materials", type=int, default=View().materials, help="to render")
     parser.add_argument("--resolution", type=int, default=View().size, help="of the pictures, in pixels")
