@@ -23,3 +23,12 @@ def old_library(tmp_path: Path) -> str:
     library = tmp_path / "libLLVM-14.so.1"
     subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source], check=True)
     return str(library)
+
+
+@pytest.fixture(scope="session")
+def compiler() -> str:
+    """A C++ compiler."""
+    found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if found is None:
+        pytest.skip("there is no C++ compiler here")
+    return found

@@ -3,7 +3,7 @@
 #
 #     tools/setup.sh demo|test
 #
-# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM) is installed with apt-get where we
+# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM, for tests g++) is installed with apt-get where we
 # are root on Debian or Ubuntu; otherwise the command to type is printed and we stop.
 # PYTHON=/path/to/python3 chooses the interpreter.
 set -eu
@@ -34,8 +34,10 @@ first_known() {
     echo "$1"
 }
 
-# Names in Debian and Ubuntu of what the system lacks.
+# Names in Debian and Ubuntu of what the system lacks for this goal.
 missing_packages() {
+    # Tests compile the C++ runtime.
+    [ "$goal" = demo ] || command -v c++ >/dev/null || echo g++
     "$python" -c 'import ensurepip, venv' 2>/dev/null ||
         "$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'
     # Dr.Jit's wheel for Linux links libatomic, which a minimal system lacks.
@@ -82,7 +84,8 @@ install_package() { # GOAL EXTRA
     printf '%s' "$wanted" >".venv/installed-$1"
 }
 
-case "${1:-}" in
+goal=${1:-}
+case "$goal" in
 demo) extra=compare ;;
 test) extra=dev ;;
 *) die "usage: tools/setup.sh demo|test" ;;
@@ -94,4 +97,4 @@ if [ -n "${DRJIT_LIBLLVM_PATH:-}" ]; then
 fi
 install_system
 make_venv
-install_package "$1" "$extra"
+install_package "$goal" "$extra"

@@ -1,0 +1,122 @@
+"""Which functions, structures and constants make up the target, as syntax trees in the order of their use.
+
+All are written in a subset of Python that every shading language has: assignments of expressions to names, arithmetic,
+comparisons, calls, fields, and one return at the end. Anything else is refused with its file and line.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+from nma import microfacet
+from nma.errors import NmaError
+from nma.target import albedo, principled, sampling
+
+STRUCTURES: tuple[type, ...] = (
+    principled.Principled,
+    principled.Geometry,
+    principled.Terms,
+    principled.Lobes,
+    albedo.Albedos,
+)
+# Callers stand after what they call.
+FUNCTIONS: tuple[Callable, ...] = (
+    microfacet.ggx_d,
+    microfacet.reflect,
+    microfacet.sample_visible_normal,
+    microfacet.fresnel_dielectric,
+    microfacet.fresnel_conductor,
+    principled.schlick_weight,
+    principled.masking_denominator,
+    principled.geometry,
+    principled.spec_alpha,
+    principled.clearcoat_alpha,
+    principled.specular_f0,
+    principled.specular_eta,
+    principled.dielectric_reflectance,
+    principled.luminance_inverse,
+    principled.gtr1_d,
+    principled.diffuse_terms,
+    principled.spec_fresnel,
+    principled.eval_pdf_lobes,
+    albedo.diffuse_albedo,
+    albedo.spec_albedo,
+    albedo.clearcoat_albedo,
+    albedo.lobe_albedos,
+    sampling.sample_diffuse,
+    sampling.sample_spec,
+    sampling.sample_clearcoat,
+)
+
+
+class Unsupported(NmaError):
+    """A construct that the exported languages do not have."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function's syntax: arguments and return value as their annotations have them, and its statements."""
+
+    name: str
+    doc: str
+    arguments: list[tuple[str, str]]
+    returns: str
+    body: list[ast.stmt]
+    module: ModuleType
+
+    def unsupported(self, node: ast.AST, what: str) -> Unsupported:
+        place = f"{self.module.__file__}:{getattr(node, 'lineno', '?')}"
+        return Unsupported(f"{place}: {what} cannot be exported; write it with arithmetic and `ops`")
+
+
+@cache
+def functions() -> tuple[Function, ...]:
+    """All of `FUNCTIONS`."""
+    return tuple(parsed(function) for function in FUNCTIONS)
+
+
+def constants() -> dict[str, float]:
+    """Numbers that the functions refer to by name, from whichever module defines them."""
+    found = {}
+    for function in functions():
+        for name in _names(function):
+            value = getattr(function.module, name, None)
+            if isinstance(value, int | float):
+                found[name] = float(value)
+    return found
+
+
+def structures() -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
+    """Name, docstring and fields (name, type) of every structure."""
+    for structure in STRUCTURES:
+        yield structure.__name__, inspect.getdoc(structure) or "", list(_annotations(structure).items())
+
+
+def _annotations(structure: type) -> dict[str, str]:
+    hints = structure.__annotations__.items()
+    return {name: str(getattr(hint, "__forward_arg__", hint)) for name, hint in hints}
+
+
+def _names(function: Function) -> list[str]:
+    """Every name that a function reads, in order."""
+    module = ast.Module(function.body, [])
+    return [node.id for node in ast.walk(module) if isinstance(node, ast.Name)]
+
+
+def parsed(function: Callable) -> Function:
+    """The syntax tree with the line numbers of the file."""
+    lines, first = inspect.getsourcelines(function)
+    tree = ast.parse("".join(lines)).body[0]
+    ast.increment_lineno(tree, first - 1)
+    module: Any = inspect.getmodule(function)
+    assert isinstance(tree, ast.FunctionDef)
+    arguments = [(a.arg, ast.unparse(a.annotation)) for a in tree.args.args if a.annotation]
+    body = tree.body[1:] if ast.get_docstring(tree) else tree.body
+    returns = ast.unparse(tree.returns) if tree.returns else ""
+    return Function(tree.name, ast.get_docstring(tree) or "", arguments, returns, body, module)

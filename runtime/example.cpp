@@ -1,0 +1,40 @@
+// Prints the directional albedo of a material by sampling it: what a renderer does at every shading point.
+//
+//     g++ -std=c++17 -O2 -Iruntime runtime/example.cpp -o example
+//     ./example nma/adapters/layered3-5x64.safetensors
+#include "nma.h"
+
+#include <cstdio>
+#include <random>
+
+// Gold of width .1 under a red coat of width .02 and index 1.5: the parameters of the class in CONVENTIONS.md.
+constexpr float RED_GOLD[13] = {.02f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
+
+int main(int count, char** words) {
+    if (count != 2) {
+        std::fprintf(stderr, "usage: %s WEIGHTS.safetensors\n", words[0]);
+        return 2;
+    }
+    try {
+        const nma::Adapter adapter = nma::Adapter::load(words[1]);
+        if (adapter.parameter_count() != 13) throw nma::Error("this example wants an adapter of the class layered3");
+        std::mt19937 engine(1);
+        std::uniform_real_distribution<float> uniform;
+        std::printf("cos(theta_i)   red   green    blue\n");
+        for (const float mu : {.1f, .3f, .5f, .7f, .9f}) {
+            const nma::Direction wi{std::sqrt(1.0f - mu * mu), 0.0f, mu};
+            const nma::Material material = adapter.prepare(RED_GOLD, mu);
+            constexpr int SAMPLES = 10000;
+            nma::Vec3<double> sum{0.0, 0.0, 0.0};
+            for (int k = 0; k < SAMPLES; ++k) {
+                const nma::Sampled s = material.sample(wi, uniform(engine), uniform(engine), uniform(engine));
+                if (s.pdf > 0.0f) sum = sum + nma::Vec3<double>{s.value.x / s.pdf, s.value.y / s.pdf, s.value.z / s.pdf};
+            }
+            const auto albedo = sum * (1.0 / SAMPLES);
+            std::printf("%12.1f %6.3f %6.3f %7.3f\n", mu, albedo.x, albedo.y, albedo.z);
+        }
+    } catch (const nma::Error& e) {
+        std::fprintf(stderr, "%s\n", e.what());
+        return 1;
+    }
+}

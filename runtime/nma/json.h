@@ -1,0 +1,183 @@
+// A reader for JSON (RFC 8259), as far as the headers of weights files need it: a tree of values, strict, bounded depth.
+#pragma once
+
+#include <cstdint>
+#include <locale>
+#include <sstream>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+namespace nma {
+
+// What is wrong with a file, where, and what to do about it.
+struct Error : std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
+
+struct Json {
+    enum class Kind { Null, Boolean, Number, String, Array, Object };
+
+    Kind kind = Kind::Null;
+    bool boolean = false;
+    double number = 0.0;
+    std::string string;
+    std::vector<Json> items;                            // of an array
+    std::vector<std::pair<std::string, Json>> fields;   // of an object, in order
+
+    // The field called `name`, or null.
+    const Json* find(std::string_view name) const {
+        for (const auto& [key, value] : fields)
+            if (key == name) return &value;
+        return nullptr;
+    }
+
+    const Json& at(std::string_view name, Kind expected) const {
+        const Json* found = find(name);
+        if (!found || found->kind != expected) throw Error("its metadata lacks a valid '" + std::string(name) + "'");
+        return *found;
+    }
+
+    static Json parse(std::string_view text);
+};
+
+namespace detail {
+
+class JsonParser {
+public:
+    explicit JsonParser(std::string_view text) : text_(text) {}
+
+    Json document() {
+        Json value = this->value(0);
+        space();
+        if (place_ != text_.size()) fail("text after its end");
+        return value;
+    }
+
+private:
+    static constexpr int DEEPEST = 32;
+
+    [[noreturn]] void fail(const char* what) const {
+        throw Error("malformed JSON at byte " + std::to_string(place_) + ": " + what);
+    }
+
+    char peek() const { return place_ < text_.size() ? text_[place_] : '\0'; }
+
+    void space() {
+        while (place_ < text_.size() && std::string_view(" \t\r\n").find(text_[place_]) != std::string_view::npos) ++place_;
+    }
+
+    bool take(std::string_view word) {
+        if (text_.substr(place_, word.size()) != word) return false;
+        place_ += word.size();
+        return true;
+    }
+
+    void expect(std::string_view word) {
+        if (!take(word)) fail("something else was expected");
+    }
+
+    Json value(int depth) {
+        if (depth > DEEPEST) fail("nested too deep");
+        space();
+        Json made;
+        switch (peek()) {
+            case '{': made.kind = Json::Kind::Object; fields(made, depth); break;
+            case '[': made.kind = Json::Kind::Array; items(made, depth); break;
+            case '"': made.kind = Json::Kind::String; made.string = string(); break;
+            case 't': expect("true"); made.kind = Json::Kind::Boolean; made.boolean = true; break;
+            case 'f': expect("false"); made.kind = Json::Kind::Boolean; break;
+            case 'n': expect("null"); break;
+            default: made.kind = Json::Kind::Number; made.number = number();
+        }
+        return made;
+    }
+
+    void fields(Json& made, int depth) {
+        expect("{");
+        space();
+        if (take("}")) return;
+        do {
+            space();
+            std::string key = string();
+            space();
+            expect(":");
+            made.fields.emplace_back(std::move(key), value(depth + 1));
+            space();
+        } while (take(","));
+        expect("}");
+    }
+
+    void items(Json& made, int depth) {
+        expect("[");
+        space();
+        if (take("]")) return;
+        do {
+            made.items.push_back(value(depth + 1));
+            space();
+        } while (take(","));
+        expect("]");
+    }
+
+    double number() {
+        const std::size_t first = place_;
+        while (place_ < text_.size() && std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos) ++place_;
+        // Unlike strtod, a stream with this locale reads a point as one in every host program.
+        std::istringstream digits(std::string(text_.substr(first, place_ - first)));
+        digits.imbue(std::locale::classic());
+        double found = 0.0;
+        if (!(digits >> found) || digits.peek() != std::char_traits<char>::eof()) fail("not a number");
+        return found;
+    }
+
+    std::string string() {
+        expect("\"");
+        std::string made;
+        while (peek() != '"') {
+            if (place_ >= text_.size()) fail("an open string");
+            const char c = text_[place_++];
+            if (c == '\\') escape(made);
+            else made.push_back(c);
+        }
+        ++place_;
+        return made;
+    }
+
+    void escape(std::string& made) {
+        const char c = peek();
+        ++place_;
+        const auto found = std::string_view("\"\\/bfnrt").find(c);
+        if (found != std::string_view::npos && c != '\0') made.push_back("\"\\/\b\f\n\r\t"[found]);
+        else if (c == 'u') made += utf8(hex());
+        else fail("an unknown escape");
+    }
+
+    std::uint32_t hex() {
+        std::uint32_t code = 0;
+        for (int k = 0; k < 4; ++k, ++place_) {
+            const auto digit = std::string_view("0123456789abcdef").find(static_cast<char>(peek() | 0x20));
+            if (digit == std::string_view::npos) fail("four hexadecimal digits were expected");
+            code = 16 * code + static_cast<std::uint32_t>(digit);
+        }
+        return code;
+    }
+
+    // A code unit; halves of surrogate pairs, which no field that is read has, stay as they are.
+    static std::string utf8(std::uint32_t code) {
+        const auto tail = [](std::uint32_t bits) { return static_cast<char>(0x80 | (bits & 0x3F)); };
+        if (code < 0x80) return {static_cast<char>(code)};
+        if (code < 0x800) return {static_cast<char>(0xC0 | (code >> 6)), tail(code)};
+        return {static_cast<char>(0xE0 | (code >> 12)), tail(code >> 6), tail(code)};
+    }
+
+    std::string_view text_;
+    std::size_t place_ = 0;
+};
+
+}  // namespace detail
+
+inline Json Json::parse(std::string_view text) { return detail::JsonParser(text).document(); }
+
+}  // namespace nma

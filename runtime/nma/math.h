@@ -1,0 +1,44 @@
+// Arithmetic that the target is written in: scalars of type T (float or double), and triples of them.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <tuple>
+
+namespace nma {
+
+template <class T> constexpr T PI = T(3.14159265358979323846);
+template <class T> constexpr T INV_PI = T(1) / PI<T>;
+
+using std::cos;
+using std::exp;
+using std::log;
+using std::sin;
+using std::sqrt;
+
+template <class T> inline T minimum(T a, T b) { return b < a ? b : a; }
+template <class T> inline T maximum(T a, T b) { return a < b ? b : a; }
+template <class T> inline T clip(T x, T low, T high) { return minimum(maximum(x, low), high); }
+template <class T> inline T select(bool condition, T a, T b) { return condition ? a : b; }
+template <class T> inline T lerp(T a, T b, T t) { return a + (b - a) * t; }
+template <class T> inline T safe_sqrt(T x) { return x > T(0) ? sqrt(x) : T(0); }
+
+// A direction or an RGB colour.
+template <class T>
+struct Vec3 {
+    T x, y, z;
+};
+
+template <class T> inline Vec3<T> operator+(const Vec3<T>& a, const Vec3<T>& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class T> inline Vec3<T> operator-(const Vec3<T>& a, const Vec3<T>& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class T> inline Vec3<T> operator*(const Vec3<T>& a, const Vec3<T>& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+template <class T> inline Vec3<T> operator*(const Vec3<T>& a, T t) { return {a.x * t, a.y * t, a.z * t}; }
+template <class T> inline Vec3<T> operator+(const Vec3<T>& a, T t) { return {a.x + t, a.y + t, a.z + t}; }
+
+template <class T> inline T dot(const Vec3<T>& a, const Vec3<T>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class T> inline Vec3<T> normalize(const Vec3<T>& v) { return v * (T(1) / sqrt(dot(v, v))); }
+template <class T> inline T mean(const Vec3<T>& c) { return (c.x + c.y + c.z) * (T(1) / T(3)); }
+// Luminance of linear sRGB (ITU-R BT.709 primaries).
+template <class T> inline T luminance(const Vec3<T>& c) { return T(0.212671) * c.x + T(0.715160) * c.y + T(0.072169) * c.z; }
+
+}  // namespace nma

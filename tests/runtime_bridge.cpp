@@ -1,0 +1,80 @@
+// What tests/test_runtime.py calls: the runtime on arrays, in float and in double.
+#include "nma.h"
+
+#include <cstring>
+
+namespace {
+
+// The fields of an instance in the order of `Principled`, then for the next one, and all weights at the end.
+template <class T>
+nma::Blend<T> blend_of(const T* numbers, int count) {
+    nma::Blend<T> made;
+    made.count = count;
+    for (int k = 0; k < count; ++k, numbers += 13) {
+        const T* p = numbers;
+        made.instances[k] = {{p[0], p[1], p[2]}, p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11], p[12]};
+    }
+    std::copy_n(numbers, count, made.weights);
+    return made;
+}
+
+template <class T>
+void evaluate(int n, int count, bool bounded, const T* blends, const T* wi, const T* wo, T* out) {
+    for (int i = 0; i < n; ++i, blends += 14 * count, wi += 3, wo += 3, out += 4) {
+        const auto prepared = nma::prepare(blend_of(blends, count), wi[2], bounded);
+        const auto e = nma::eval_pdf<T>(prepared, {wi[0], wi[1], wi[2]}, {wo[0], wo[1], wo[2]});
+        const T row[] = {e.value.x, e.value.y, e.value.z, e.pdf};
+        std::copy_n(row, 4, out);
+    }
+}
+
+}  // namespace
+
+extern "C" {
+
+void evaluate_float(int n, int count, bool bounded, const float* blends, const float* wi, const float* wo, float* out) {
+    evaluate(n, count, bounded, blends, wi, wo, out);
+}
+
+void evaluate_double(int n, int count, bool bounded, const double* blends, const double* wi, const double* wo, double* out) {
+    evaluate(n, count, bounded, blends, wi, wo, out);
+}
+
+// Rows of wo, value and pdf.
+void sample_double(int n, int count, const double* blends, const double* wi, const double* u, double* out) {
+    for (int i = 0; i < n; ++i, blends += 14 * count, wi += 3, u += 3, out += 7) {
+        const auto prepared = nma::prepare(blend_of(blends, count), wi[2], false);
+        const auto s = nma::sample<double>(prepared, {wi[0], wi[1], wi[2]}, u[0], u[1], u[2]);
+        const double row[] = {s.wo.x, s.wo.y, s.wo.z, s.value.x, s.value.y, s.value.z, s.pdf};
+        std::copy_n(row, 7, out);
+    }
+}
+
+// An adapter from the bytes of a weights file, or null and the reason in `message`.
+nma::Adapter* adapter_new(const char* bytes, std::size_t size, char* message, std::size_t room) {
+    try {
+        return new nma::Adapter(nma::Adapter::from_memory(bytes, size));
+    } catch (const nma::Error& e) {
+        std::strncpy(message, e.what(), room - 1);
+        return nullptr;
+    }
+}
+
+void adapter_delete(nma::Adapter* adapter) { delete adapter; }
+
+void adapter_outputs(const nma::Adapter* adapter, int n, int size, const float* params, const float* cosines, float* out) {
+    float raw[nma::WIDEST_LAYER];
+    for (int i = 0; i < n; ++i, params += adapter->parameter_count(), out += size) {
+        adapter->network_outputs(params, cosines[i], raw);
+        std::copy_n(raw, size, out);
+    }
+}
+
+void adapter_evaluate(const nma::Adapter* adapter, int n, const float* params, const float* wi, const float* wo, float* out) {
+    for (int i = 0; i < n; ++i, params += adapter->parameter_count(), wi += 3, wo += 3, out += 4) {
+        const auto e = adapter->prepare(params, wi[2]).eval({wi[0], wi[1], wi[2]}, {wo[0], wo[1], wo[2]});
+        const float row[] = {e.value.x, e.value.y, e.value.z, e.pdf};
+        std::copy_n(row, 4, out);
+    }
+}
+}
