@@ -3,8 +3,8 @@
 #
 #     tools/setup.sh demo|test
 #
-# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM, for tests g++) is installed with apt-get where we
-# are root on Debian or Ubuntu; otherwise the command to type is printed and we stop.
+# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM, for the tests g++) is installed with
+# apt-get where we are root on Debian or Ubuntu; otherwise the command to type is printed and we stop.
 # PYTHON=/path/to/python3 chooses the interpreter.
 set -eu
 cd "$(dirname "$0")/.."

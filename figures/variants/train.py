@@ -52,13 +52,13 @@ class Job:
 
 
 def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list[Job]:
-    """All jobs: seed by seed, so that early results span all variants; bounds and more instances with them."""
+    """All jobs: seed by seed, so that early results span all variants; bounds and more instances with the first one."""
     jobs, sizes = [], sorted(set(sizes))
     for seed in range(seeds):
         jobs += [Job(name, size, seed, steps) for size in sizes for name in VARIANTS]
-        jobs += [Job(name, max(sizes), seed, steps) for name in instances]
-        # A bound needs no error bar.
-        jobs += [Job(name, 0, seed, steps) for name in VARIANTS if seed == 0]
+        if seed == 0:
+            jobs += [Job(name, 0, seed, steps) for name in VARIANTS]
+            jobs += [Job(name, max(sizes), seed, steps) for name in instances]
     return jobs
 
 
