@@ -31,7 +31,7 @@ class View(NamedTuple):
 
     materials: int = 89
     size: int = 128
-    spp: int = 192
+    spp: int = 128
     reference_spp: int = 512
 
 
@@ -63,6 +63,13 @@ class Gallery:
             return material_bsdf(material, "nma", adapter=weights)
 
         return self._kept(job.stem, bsdf, self._view.spp, ADAPTER_SEED, newer_than=weights)
+
+    def shipped(self, name: str) -> dict[str, float]:
+        """The image metrics of a shipped adapter, which has seen the same data for many more steps."""
+        pictures = self._kept(
+            name, lambda m: material_bsdf(m, "nma", adapter=name), self._view.spp, ADAPTER_SEED
+        )
+        return compare(pictures, self.reference)
 
     def _simulated(self, spp: int, seed: int) -> Images:
         return self._kept("reference", lambda m: material_bsdf(m, "layered"), spp, seed)

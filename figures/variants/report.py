@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from paper import PERCENT, TABLE_2, TABLE_3
 from train import INSTANCES, VARIANTS, Job
 
+import nma
 from nma.image_metrics import METRICS
 
 Results = dict[Job, dict[str, Any]]
@@ -79,7 +80,7 @@ def markdown(found: dict[str, Any], noise: dict[str, float], floor: float) -> st
     parts = ["## Log loss (Fig. 3)", loss_table(found["log_loss"]), f"Noise of the references: {floor:.5f}."]
     parts += ["## Ordering", ordering_lines(found["ordering"])]
     for title, names, paper in (
-        ("## Images (Table 2)", {name: name for name in VARIANTS}, TABLE_2),
+        ("## Images (Table 2)", {name: name for name in (*VARIANTS, *nma.shipped())}, TABLE_2),
         ("## Instances (Table 3)", ROWS_3, TABLE_3),
     ):
         parts += [title, image_table(found["images"], names, paper, noise)]

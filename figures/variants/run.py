@@ -103,6 +103,9 @@ def write(
     floor = next(iter(results.values()))["tables"]["noise_floor"]
     noise = gallery.noise()
     found = report.summary(results, arguments.sizes)
+    for name in nma.shipped():
+        metrics = gallery.shipped(name).items()
+        found["images"][name] = {metric: report.statistics([value]) for metric, value in metrics}
     tables = report.markdown(found, noise, floor)
     print(tables)
     (folder / "tables.md").write_text(tables)
