@@ -42,6 +42,7 @@ CHANGES = {
     "paper, 1e-5": {"preset": "paper"},
     "paper, 1e-4": {"preset": "paper", "learning_rate": 1e-4},
     "paper, 1e-3": {"preset": "paper", "learning_rate": 1e-3},
+    "paper, 3e-3": {"preset": "paper", "learning_rate": 3e-3},
 }
 FIGURES = ("log_loss", "albedo_error", "smape")
 
