@@ -38,7 +38,7 @@ FIGURES = ("log_loss", "albedo_error")
 
 def main() -> None:
     parser = common.parser(__doc__)
-    parser.add_argument("--materials", type=int, default=8)
+    parser.add_argument("--materials", type=int, default=6)
     parser.add_argument("--steps", type=int, default=4000, help="of each fit")
     arguments = parser.parse_args()
     if arguments.quick:
