@@ -8,10 +8,12 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import nma
+from nma.metrics import table_metrics
 
 ROOT = Path(__file__).parent.parent
 REFERENCES = ROOT / "out/references"
@@ -54,6 +56,28 @@ def reference(name: str, quick: bool) -> nma.Tables:
         if not path.exists():
             subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
     return nma.Tables.load(path)
+
+
+def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
+    """What `make` returned when it was first called for this JSON file, or returns now."""
+    if again or not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A whole file or none, whenever the run is killed.
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps(make()))
+        partial.replace(path)
+    return json.loads(path.read_text())
+
+
+def figures(
+    adapter: nma.Adapter, tables: nma.Tables, directions: int | None = None
+) -> list[dict[str, float]]:
+    """The adapter's figures for every material, integrated once; `nma.evaluate_adapter` does so twice to know how
+    exact it is. The tables must have standard errors."""
+    return [
+        table_metrics(nma.tabulate_adapter(adapter, params[None], directions=directions)[0], table, error)
+        for params, table, error in zip(tables.params, tables.values, tables.error, strict=True)
+    ]
 
 
 def row(angle: float, rows: int) -> int:

@@ -83,6 +83,11 @@ class Tables:
         """Directional albedo (n, theta_i[, phi_i], 3): 2 pi times the mean over the bins of wo."""
         return 2.0 * math.pi * self.values.mean(axis=(-3, -2), dtype=np.float64)
 
+    def __getitem__(self, chosen: slice | NDArray) -> Tables:
+        """The tables of some materials, by a slice or by their numbers."""
+        error = None if self.error is None else self.error[chosen]
+        return Tables(self.params[chosen], self.values[chosen], self.walks[chosen], error)
+
     @staticmethod
     def concatenate(parts: Sequence[Tables]) -> Tables:
         """One after the other; all of them with errors, or none."""

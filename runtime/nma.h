@@ -66,10 +66,10 @@ public:
 
     static Adapter load(const std::string& path) {
         try {
-            return Adapter(read_weights(path));
+            const std::string bytes = read_file(path);
+            return from_memory(bytes.data(), bytes.size());
         } catch (const Error& e) {
-            const std::string message = e.what();
-            throw Error(message.rfind(path, 0) == 0 ? message : path + ": " + message);
+            throw Error(path + ": " + e.what());
         }
     }
 

@@ -350,3 +350,14 @@ def test_tables_are_joined_with_their_errors(tables):
 
 def test_walks_are_counted_on_the_device_that_dr_jit_chose():
     assert dr.backend_v(dr.auto.Float) in (dr.JitBackend.LLVM, dr.JitBackend.CUDA)
+
+
+def test_some_materials_of_tables_keep_what_belongs_to_them():
+    params, values = np.arange(3.0)[:, None], np.arange(6.0).reshape(3, 1, 1, 1, 2)
+    whole = Tables(params, values, np.array([5, 6, 7]), values + 1.0)
+    for part in (whole[1:], whole[np.array([1, 2])]):
+        assert part.params.tolist() == [[1.0], [2.0]]
+        assert part.walks.tolist() == [6, 7]
+        np.testing.assert_array_equal(part.values, values[1:])
+        np.testing.assert_array_equal(part.error, values[1:] + 1.0)
+    assert Tables(params, values, np.array([5, 6, 7]))[:1].error is None

@@ -11,7 +11,9 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -56,16 +58,14 @@ def main() -> None:
     folder = common.results(__file__, arguments.quick)
     names = arguments.only or list(CHANGES)[: 2 if arguments.quick else None]
     steps = 100 if arguments.quick else arguments.steps
-    references = {name: thinned(common.reference(name, arguments.quick)) for name in common.SETS}
-    tables = None
+    # Every third material.
+    references = {name: common.reference(name, arguments.quick)[::3] for name in common.SETS}
+    # Read when a training first needs them.
+    tables = cache(lambda: data(arguments.data, arguments.quick))
     results = {}
     for name in names:
         stored = common.ROOT / "out/figures/ablation" / f"{name}-{steps}.json"
-        if not stored.exists() or arguments.quick:
-            tables = tables or data(arguments.data, arguments.quick)
-            stored.parent.mkdir(parents=True, exist_ok=True)
-            stored.write_text(json.dumps(train(name, tables, references, steps)))
-        results[name] = json.loads(stored.read_text())
+        results[name] = common.kept(stored, partial(train, name, tables, references, steps), arguments.quick)
         print(f"{name:20}", json.dumps(results[name]), flush=True)
     common.write_json(folder / "ablation.json", results)
     plot(results, folder / "ablation.png")
@@ -79,19 +79,13 @@ def data(path: Path, quick: bool) -> nma.Tables:
     )
 
 
-def thinned(tables: nma.Tables) -> nma.Tables:
-    """Every third material."""
-    kept = {name: getattr(tables, name)[::3] for name in ("params", "values", "walks", "error")}
-    return replace(tables, **kept)
-
-
-def train(name: str, tables: nma.Tables, references: dict[str, nma.Tables], steps: int) -> dict:
+def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma.Tables], steps: int) -> dict:
     """Figures of one change. Every run sees as many bins as the preset `class` does in `steps`."""
     change = dict(CHANGES[name])
     recipe = preset(change.pop("preset", "class"), **change)
     recipe = replace(recipe, steps=steps * preset("class").bins_per_step // recipe.bins_per_step)
     began = time.perf_counter()
-    adapter, _ = train_class(nma.LAYERED3, recipe, tables, {})
+    adapter, _ = train_class(nma.LAYERED3, recipe, tables(), {})
     result: dict = {"steps": recipe.steps, "seconds": round(time.perf_counter() - began)}
     for label, reference in references.items():
         evaluation = nma.evaluate_adapter(adapter, reference)

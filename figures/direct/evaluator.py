@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 import nma
 from nma import ava, network, ops
@@ -60,13 +59,9 @@ def start(materials: int, how: Recipe) -> Evaluator:
     """Random latents and layers."""
     rng = np.random.default_rng((how.seed, 0xD1EC7))
     sizes = [LATENT + FEATURES, *network.hidden(how.network), 3]
-    bias = np.full(3, np.log(np.expm1(_INITIAL)))
-    return Evaluator(latents(materials, how), network.init(rng, sizes, bias))
-
-
-def latents(materials: int, how: Recipe) -> NDArray[np.float32]:
+    decoder = network.init(rng, sizes, np.full(3, np.log(np.expm1(_INITIAL))))
     rng = np.random.default_rng((how.seed, 0x1A7E))
-    return 0.1 * rng.standard_normal((materials, LATENT), dtype=np.float32)
+    return Evaluator(0.1 * rng.standard_normal((materials, LATENT), dtype=np.float32), decoder)
 
 
 def evaluate(decoder: Layers, latent: Any, wi: Vec3, wo: Vec3) -> Any:

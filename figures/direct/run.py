@@ -31,7 +31,6 @@ from nma.dataset import Settings, simulate_block
 from nma.metrics import mean_metrics, table_metrics
 from nma.ops import Vec3
 from nma.table import ISOTROPIC
-from nma.train.loop import Run
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
@@ -79,7 +78,7 @@ def main() -> None:
         evaluate = of_adapter(adapter, reference.params)
         results[name] = judge(evaluate, reference, POINTS)
         results[name] |= {
-            "exact": exact(adapter, reference),
+            "exact": figures(common.figures(adapter, reference)),
             "parameters": network.parameters(adapter.layers),
         }
         print_means(name, results[name])
@@ -87,7 +86,7 @@ def main() -> None:
     results[label] = judge(of_evaluator(trained), reference, DIRECT_POINTS)
     results[label] |= {"parameters": network.parameters(trained.decoder), **how}
     print_means(label, results[label])
-    text = markdown(results, floor(reference))
+    text = markdown(results)
     print(text)
     (folder / "direct.md").write_text(text)
     common.write_json(folder / "direct.json", results)
@@ -102,12 +101,12 @@ def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict
     how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
     # The validation set decides nothing about the decoder.
     stem, record = f"{how.network}_{settings.materials}_{how.steps}-steps", {"dataset": asdict(settings)}
-    with Bar("decoder", how.steps) as bar:
+    with console.TrainingBar(how, "decoder") as bar:
         whole, run = direct.train(tables, how, record, kept / f"{stem}.ckpt", bar.update)
     again = direct.recipe(arguments.latent_steps, how.network)
     record |= {"decoder": how.steps, "validation": f"{SET}-{len(reference.params)}"}
     path = kept / f"{stem}_{again.steps}-latent-steps.ckpt"
-    with Bar("latents", again.steps) as bar:
+    with console.TrainingBar(again, "latents") as bar:
         fitted, fit = direct.train(reference, again, record, path, bar.update, whole.decoder)
     took = {"bins_seen": how.steps * how.bins_per_step, "training_seconds": round(run.seconds)}
     return fitted, took | {"latent_seconds_per_material": round(fit.seconds / len(reference.params), 2)}
@@ -119,25 +118,6 @@ def data(path: Path, quick: bool) -> tuple[Settings, nma.Tables]:
         return settings, simulate_block(settings, range(16))
     dataset = nma.Dataset.open(path)
     return dataset.settings, dataset.load()
-
-
-class Bar:
-    """A progress bar with steps per second and the log loss."""
-
-    def __init__(self, title: str, steps: int):
-        self._bar = console.progress("steps/s")
-        self._task = self._bar.add_task(title, total=steps, rate="", note="")
-
-    def __enter__(self) -> Bar:
-        self._bar.__enter__()
-        return self
-
-    def __exit__(self, *args: Any) -> None:
-        self._bar.__exit__(*args)
-
-    def update(self, run: Run) -> None:
-        note = f"log loss {np.mean(run.log_losses[-200:]):.5f}"
-        self._bar.update(self._task, completed=run.step, rate=f"{run.step / run.seconds:.1f}", note=note)
 
 
 def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
@@ -197,36 +177,17 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
     }
 
 
-def exact(adapter: nma.Adapter, reference: nma.Tables) -> dict[str, Any]:
-    """The adapter by its converged bin means: its own error, without that of few points per bin."""
-    return figures(
-        [
-            table_metrics(nma.tabulate_adapter(adapter, params[None])[0], table, error)
-            for params, table, error in zip(reference.params, reference.values, reference.error, strict=True)
-        ]
-    )
-
-
 def figures(materials: list[dict[str, float]]) -> dict[str, Any]:
     """Means over the materials, and each one's figures."""
     rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
     return {"mean": {k: round(v, 6) for k, v in mean_metrics(materials).items()}, "materials": rounded}
 
 
-def floor(reference: nma.Tables) -> float:
-    """The log loss of a perfect model."""
-    found = [
-        table_metrics(table, table, error)["noise_floor"]
-        for table, error in zip(reference.values, reference.error, strict=True)
-    ]
-    return float(np.mean(found))
-
-
 def print_means(name: str, result: dict[str, Any]) -> None:
     print(name, {k: result["mean"][k] for k in COLUMNS}, f"{result['seconds']} s", flush=True)
 
 
-def markdown(results: dict[str, Any], noise: float) -> str:
+def markdown(results: dict[str, Any]) -> str:
     """Table 5 with the paper's rows."""
     lines = ["| | " + " | ".join(COLUMNS.values()) + " | time, s | parameters |", "|---" * 8 + "|"]
     for name, result in results.items():
@@ -239,6 +200,7 @@ def markdown(results: dict[str, Any], noise: float) -> str:
     for name, row in PAPER.items():
         cells = [f"{row[k]:.4g}" if k in row else "" for k in COLUMNS]
         lines.append(f"| {name} | " + " | ".join([*cells, f"{row['seconds']:.4g}", ""]) + " |")
+    noise = next(iter(results.values()))["mean"]["noise_floor"]
     return "\n".join(lines) + f"\n\nNoise of the references: {noise:.5f} in log loss.\n"
 
 

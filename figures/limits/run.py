@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import sys
 from argparse import Namespace
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,28 +53,22 @@ def main() -> None:
     plot(rows, folder / "limits.png")
 
 
-def one(reference: nma.Tables, number: int) -> nma.Tables:
-    """The reference of a single material."""
-    kept = {
-        name: getattr(reference, name)[number : number + 1] for name in ("params", "values", "walks", "error")
-    }
-    return replace(reference, **kept)
-
-
 def contenders(reference: nma.Tables, number: int, arguments: Namespace) -> dict:
     """Figures of the shipped adapters, of fits of all targets, and of the reference's noise, for a material."""
     stored = common.ROOT / "out/figures/limits" / f"{number}-{len(reference.params)}-{arguments.steps}.json"
-    if not stored.exists() or arguments.quick:
-        table = one(reference, number)
-        row: dict = {"params": [round(float(x), 5) for x in table.params[0]]}
-        for name in nma.shipped()[::-1]:
-            row[name], row["noise"] = figures(nma.Adapter.load(name), table)
-        for name in list(TARGETS)[: 1 if arguments.quick else None]:
-            row[name] = fit(table, preset("single", steps=arguments.steps, **TARGETS[name]))
-        stored.parent.mkdir(parents=True, exist_ok=True)
-        stored.write_text(json.dumps(row))
-        print(number, {k: v["log_loss"] for k, v in row.items() if k != "params"}, flush=True)
-    return json.loads(stored.read_text())
+    table = reference[number : number + 1]
+    return common.kept(stored, partial(compete, number, table, arguments), arguments.quick)
+
+
+def compete(number: int, table: nma.Tables, arguments: Namespace) -> dict:
+    """`contenders`, worked out."""
+    row: dict = {"params": [round(float(x), 5) for x in table.params[0]]}
+    for name in nma.shipped()[::-1]:
+        row[name], row["noise"] = figures(nma.Adapter.load(name), table)
+    for name in list(TARGETS)[: 1 if arguments.quick else None]:
+        row[name] = fit(table, preset("single", steps=arguments.steps, **TARGETS[name]))
+    print(number, {k: v["log_loss"] for k, v in row.items() if k != "params"}, flush=True)
+    return row
 
 
 def fit(table: nma.Tables, recipe: Recipe) -> dict[str, float]:

@@ -48,8 +48,7 @@ def chosen(tables: nma.Tables) -> nma.Tables:
     order = np.argsort(tables.params[:, nma.LAYERED3.slices["alpha_top"]][:, 0])
     count = min(MATERIALS, len(order))
     picked = order[((np.arange(count) + 0.5) / count * len(order)).astype(int)]
-    error = None if tables.error is None else tables.error[picked]
-    return nma.Tables(tables.params[picked], tables.values[picked], tables.walks[picked], error)
+    return tables[picked]
 
 
 def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:

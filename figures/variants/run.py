@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import report
 from images import Gallery, View, sheet
-from train import ALL, INSTANCES, VARIANTS, Job, Store, first, plan
+from train import ALL, INSTANCES, VARIANTS, Job, Store, plan
 
 import nma
 import nma.render
@@ -45,7 +45,7 @@ def main() -> None:
     if quick:
         # Compiling takes longer than these few steps.
         jax.config.update("jax_disable_most_optimizations", True)
-        validation = first(validation, QUICK_VALIDATION)
+        validation = validation[:QUICK_VALIDATION]
     name = f"{SET}-{len(validation.params)}x{int(validation.walks[0])}"
     store = Store(kept, data, validation, name)
     store.check(arguments.sizes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,9 +13,12 @@ from typing import Any
 
 import nma
 from nma.errors import NmaError
-from nma.metrics import mean_metrics, table_metrics
+from nma.metrics import mean_metrics
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
 
 # The paper's variants: (instances, whether their parameters follow the view direction).
 VARIANTS = {
@@ -60,12 +64,6 @@ def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list
             jobs += [Job(name, 0, seed, steps) for name in VARIANTS]
             jobs += [Job(name, max(sizes), seed, steps) for name in instances]
     return jobs
-
-
-def first(tables: nma.Tables, count: int) -> nma.Tables:
-    """The first materials of some tables."""
-    error = None if tables.error is None else tables.error[:count]
-    return nma.Tables(tables.params[:count], tables.values[:count], tables.walks[:count], error)
 
 
 class Store:
@@ -123,11 +121,7 @@ class Store:
 
         def measure() -> dict[str, float]:
             # A quarter of the points of `nma.evaluate_adapter`: .00003 more than it finds, in all variants.
-            wanted = self.validation
-            found = [
-                table_metrics(nma.tabulate_adapter(adapter, params[None], directions=16)[0], table, error)
-                for params, table, error in zip(wanted.params, wanted.values, wanted.error, strict=True)
-            ]
+            found = common.figures(adapter, self.validation, directions=16)
             return {name: round(value, 7) for name, value in mean_metrics(found).items()}
 
         return self.cached(job, "tables", {"validation": self._name}, adapter, measure)
@@ -153,7 +147,7 @@ class Store:
     def _training_set(self, job: Job) -> nma.Tables:
         if job.size == 0:
             return self.validation
-        return first(self._tables, job.size)
+        return self._tables[: job.size]
 
     def _record(self, job: Job) -> dict[str, Any]:
         """Where the training's data come from, as the weights file has it."""

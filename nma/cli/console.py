@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -42,3 +44,30 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str 
     for row in rows:
         result.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row))
     return result
+
+
+class TrainingBar:
+    """A progress bar that shows the loss over the last steps and bins per second."""
+
+    def __init__(self, recipe: Any, title: str = "training"):
+        self._bar, self._recipe, self._title = progress("Mbins/s"), recipe, title
+        self._began, self._first = time.perf_counter(), None
+
+    def __enter__(self) -> TrainingBar:
+        self._bar.__enter__()
+        self._task = self._bar.add_task(self._title, total=self._recipe.steps, rate="", note="")
+        return self
+
+    def __exit__(self, *args: Any) -> None:
+        self._bar.__exit__(*args)
+
+    def update(self, run: Any) -> None:
+        if self._first is None:
+            self._first, self._began = run.step, time.perf_counter()
+            return
+        rate = (
+            (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
+        )
+        recent = run.log_losses[-500:]
+        note = f"log loss {sum(recent) / len(recent):.5f}"
+        self._bar.update(self._task, completed=run.step, rate=f"{rate:.2f}", note=note)

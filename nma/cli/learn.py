@@ -7,7 +7,7 @@ import math
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -99,7 +99,7 @@ def train(
     source, record = _training_data(class_name, data, stream, walks, recipe.seed)
     checkpoint = output.with_name(output.name + ".ckpt")
     output.parent.mkdir(parents=True, exist_ok=True)
-    with _TrainingBar(recipe) as bar:
+    with console.TrainingBar(recipe) as bar:
         adapter, run = training.train_class(
             space, recipe, source, record, checkpoint=checkpoint, refresh=refresh, progress=bar.update
         )
@@ -157,7 +157,7 @@ def fit(
     tables = tabulate(source, vector[None], walks, stream_keys(recipe.seed, range(1)), error=False)
     console.err.print(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
     record = {"data": f"material {material}", "material": source_material.name, "walks_per_material": walks}
-    with _TrainingBar(recipe) as bar:
+    with console.TrainingBar(recipe) as bar:
         adapter, run = training.fit_material(
             source.space, recipe, vector, tables, record, progress=bar.update
         )
@@ -263,29 +263,3 @@ def _finish(adapter, run, output: Path) -> None:
         f"{output}: {adapter.variant}, {run.step} steps in {run.seconds:.0f} s, "
         f"log loss of the last steps {np.mean(run.log_losses[-500:]):.5f} (against noisy bins); losses in {plot}"
     )
-
-
-class _TrainingBar:
-    """A progress bar that shows the loss over the last steps and bins per second."""
-
-    def __init__(self, recipe: Any):
-        self._bar, self._recipe = console.progress("Mbins/s"), recipe
-        self._began, self._first = time.perf_counter(), None
-
-    def __enter__(self) -> _TrainingBar:
-        self._bar.__enter__()
-        self._task = self._bar.add_task("training", total=self._recipe.steps, rate="", note="")
-        return self
-
-    def __exit__(self, *args: Any) -> None:
-        self._bar.__exit__(*args)
-
-    def update(self, run: Any) -> None:
-        if self._first is None:
-            self._first, self._began = run.step, time.perf_counter()
-            return
-        rate = (
-            (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
-        )
-        loss = np.mean(run.log_losses[-500:])
-        self._bar.update(self._task, completed=run.step, rate=f"{rate:.2f}", note=f"log loss {loss:.5f}")

@@ -81,6 +81,7 @@ def functions() -> tuple[Function, ...]:
     return tuple(parsed(function) for function in FUNCTIONS)
 
 
+@cache
 def constants() -> dict[str, float]:
     """Numbers that the functions refer to by name, from whichever module defines them."""
     found = {}

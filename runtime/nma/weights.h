@@ -1,6 +1,7 @@
 // The weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of nma/weights.py.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <fstream>
@@ -161,16 +162,11 @@ inline Weights weights(const char* bytes, std::size_t size) {
 // The contents of a weights file in memory. Throws `Error`.
 inline Weights parse_weights(const void* bytes, std::size_t size) { return detail::weights(static_cast<const char*>(bytes), size); }
 
-// The contents of a weights file. Throws `Error`, with the path in its message.
-inline Weights read_weights(const std::string& path) {
+// The bytes of a file. Throws `Error`.
+inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
-    if (!file) throw Error(path + ": no such weights file, or it cannot be read");
-    const std::string bytes{std::istreambuf_iterator<char>(file), {}};
-    try {
-        return parse_weights(bytes.data(), bytes.size());
-    } catch (const Error& e) {
-        throw Error(path + ": " + e.what());
-    }
+    if (!file) throw Error("no such weights file, or it cannot be read");
+    return {std::istreambuf_iterator<char>(file), {}};
 }
 
 }  // namespace nma
