@@ -5,10 +5,12 @@
 //     const nma::Value v = at_hit.eval(wi, wo);                                  // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = at_hit.sample(wi, u_lobe, u1, u2);
 //
-// C++17, no dependencies. Loading allocates and throws `nma::Error`; everything else does neither and is safe to call
+// C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading allocates and throws `nma::Error`; everything else does neither and is safe to call
 // from many threads at once. Directions are unit vectors in the local frame, z up, `wi` towards the viewer, `wo` towards
 // the light. Lobes of adapters with `in_plane` parameters are stretched along the plane of incidence, which is found here.
 #pragma once
+
+#include <cstddef>
 
 #include "nma/blend.h"
 #include "nma/network.h"
@@ -43,6 +45,7 @@ public:
 
 private:
     friend class Adapter;
+    friend class Curves;
 
     // Rotation about z into the frame whose x axis lies in the plane of incidence. Twin of nma/target/plane.py.
     struct Plane {
@@ -60,58 +63,84 @@ private:
     bool in_plane_ = false;
 };
 
+// How a weights file is loaded.
+struct Options {
+    // avx512_bf16 halves the time of a network, for activations of 8 bits; otherwise all is float32.
+    InstructionSet set = fastest();
+};
+
 class Adapter {
 public:
     static constexpr const char* DIALECT = "mitsuba-principled-reflection";
+    // Queries that `prepare_many` works on at once.
+    static constexpr int BLOCK = 24;
 
-    static Adapter load(const std::string& path) {
+    static Adapter load(const std::string& path, const Options& options = {}) {
         try {
             const std::string bytes = read_file(path);
-            return from_memory(bytes.data(), bytes.size());
+            return from_memory(bytes.data(), bytes.size(), options);
         } catch (const Error& e) {
             throw Error(path + ": " + e.what());
         }
     }
 
-    static Adapter from_memory(const void* bytes, std::size_t size) { return Adapter(parse_weights(bytes, size)); }
+    static Adapter from_memory(const void* bytes, std::size_t size, const Options& options = {}) { return Adapter(parse_weights(bytes, size), options); }
 
     // Numbers that `prepare` takes, in the order of `parameters`.
     int parameter_count() const { return parameter_count_; }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
+    // Numbers that describe a blend, and what the network returns for them.
+    int output_count() const { return output_count_; }
+    InstructionSet instruction_set() const { return network_.instruction_set(); }
 
     // The blend for the parameters of the source material at cos(theta_i).
     Material prepare(const float* parameters, float cos_theta_i) const {
-        alignas(64) float raw[WIDEST_LAYER];
-        network_outputs(parameters, cos_theta_i, raw);
-        Material made;
-        made.prepared_ = nma::prepare(decode(raw, cos_theta_i), cos_theta_i, weights_.bounded);
-        made.in_plane_ = in_plane_;
-        return made;
+        alignas(64) float numbers[WIDEST_LAYER];
+        network_outputs(parameters, cos_theta_i, numbers);
+        return decoded(numbers, cos_theta_i);
     }
 
-    // What the network returns, before decoding; `raw` has room for WIDEST_LAYER numbers.
+    // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
+    void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
+        alignas(64) float outputs[BLOCK * WIDEST_LAYER];
+        for (int first = 0; first < count; first += BLOCK) {
+            const int now = std::min(BLOCK, count - first);
+            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count_, cos_theta_i + first, outputs);
+            for (int q = 0; q < now; ++q) materials[first + q] = decoded(outputs + q * network_.output_stride(), cos_theta_i[first + q]);
+        }
+    }
+
+    // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
     void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
-        float inputs[WIDEST_LAYER];
+        alignas(64) float inputs[WIDEST_LAYER];
         encode(parameters, cos_theta_i, inputs);
         network_.forward(inputs, raw);
     }
 
+    // Likewise for many, rows of `output_count` numbers.
+    void network_outputs_many(int count, const float* parameters, const float* cos_theta_i, float* raw) const {
+        alignas(64) float outputs[BLOCK * WIDEST_LAYER];
+        for (int first = 0; first < count; first += BLOCK) {
+            const int now = std::min(BLOCK, count - first);
+            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count_, cos_theta_i + first, outputs);
+            for (int q = 0; q < now; ++q)
+                std::copy_n(outputs + q * network_.output_stride(), output_count_, raw + static_cast<std::size_t>(first + q) * output_count_);
+        }
+    }
+
 private:
+    friend class Curves;
+
     enum class Encoding { Raw, Direction, Layered3 };
 
-    // Where a number of the network goes, and its range.
-    struct Field {
-        float Principled<float>::*scalar;  // null for channels of the base colour
-        float Vec3<float>::*channel;
-        float low, span;  // of a logarithmic one the factor, and the logarithm of the ratio of its ends
-        bool logarithmic, in_plane;
-    };
-
-    explicit Adapter(Weights weights) : weights_(std::move(weights)), network_(weights_.layers) {
+    Adapter(Weights weights, const Options& options) : weights_(std::move(weights)), network_(weights_.layers, options.set) {
         for (const SourceParam& p : weights_.parameters) parameter_count_ += p.size;
         for (const TargetParam& p : weights_.target) add_fields(p);
         encoding_ = encoding_named(weights_.encoding);
+        output_count_ = static_cast<int>(offsets_.size()) * weights_.instances + weights_.instances - 1;
         check();
+        lay_out_ranges();
+        weights_.layers.clear();
     }
 
     static Encoding encoding_named(const std::string& name) {
@@ -121,27 +150,21 @@ private:
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
+    // Remembers where in a `Principled` the numbers of a parameter go.
     void add_fields(const TargetParam& p) {
         using P = Principled<float>;
-        static constexpr std::pair<const char*, float P::*> SCALARS[] = {
-            {"roughness", &P::roughness}, {"metallic", &P::metallic}, {"specular", &P::specular},
-            {"spec_tint", &P::spec_tint}, {"sheen", &P::sheen}, {"sheen_tint", &P::sheen_tint},
-            {"clearcoat", &P::clearcoat}, {"clearcoat_gloss", &P::clearcoat_gloss},
-            {"anisotropic", &P::anisotropic}, {"flatness", &P::flatness}};
-        const double span = p.logarithmic ? std::log(p.high / p.low) : p.high - p.low;
-        Field field{nullptr, nullptr, static_cast<float>(p.low), static_cast<float>(span), p.logarithmic, p.in_plane};
+        static constexpr std::pair<const char*, std::size_t> FIELDS[] = {
+            {"base_color", offsetof(P, base_color)}, {"roughness", offsetof(P, roughness)}, {"metallic", offsetof(P, metallic)},
+            {"specular", offsetof(P, specular)}, {"spec_tint", offsetof(P, spec_tint)}, {"sheen", offsetof(P, sheen)},
+            {"sheen_tint", offsetof(P, sheen_tint)}, {"clearcoat", offsetof(P, clearcoat)}, {"clearcoat_gloss", offsetof(P, clearcoat_gloss)},
+            {"anisotropic", offsetof(P, anisotropic)}, {"flatness", offsetof(P, flatness)}};
         in_plane_ |= p.in_plane;
-        if (p.name == "base_color" && p.size == 3) {
-            for (const auto channel : {&Vec3<float>::x, &Vec3<float>::y, &Vec3<float>::z}) {
-                field.channel = channel;
-                fields_.push_back(field);
+        for (const auto& [name, offset] : FIELDS)
+            if (p.name == name && p.size == (p.name == "base_color" ? 3 : 1)) {
+                for (int c = 0; c < p.size; ++c) offsets_.push_back(offset + c * sizeof(float));
+                return;
             }
-            return;
-        }
-        for (const auto& [name, scalar] : SCALARS)
-            if (p.name == name && p.size == 1) field.scalar = scalar;
-        if (!field.scalar) throw Error("unknown target parameter '" + p.name + "'; upgrade the runtime");
-        fields_.push_back(field);
+        throw Error("unknown target parameter '" + p.name + "'; upgrade the runtime");
     }
 
     // Refuses a network that does not fit its own description, or this version's target.
@@ -150,25 +173,51 @@ private:
         if (weights_.instances > MAX_INSTANCES) throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
         const int expected = encoding_ == Encoding::Direction ? 1 : encoding_ == Encoding::Raw ? parameter_count_ + weights_.directional
                                                                                                 : 13 + 3 * weights_.directional;
-        const int size = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
         if (encoding_ == Encoding::Layered3 && (parameter_count_ != 13 || weights_.parameters.size() != 7)) throw Error("the encoding 'layered3' belongs to another class");
-        if (weights_.layers.front().in != expected || weights_.layers.back().out != size)
+        if (weights_.layers.front().in != expected || weights_.layers.back().out != output_count_)
             throw Error("the network does not fit its description; train again");
     }
 
-    // Twin of nma/encoding.py.
-    void encode(const float* p, float cosine, float* x) const {
-        if (encoding_ == Encoding::Direction) {
-            x[0] = weights_.directional ? 2.0f * cosine - 1.0f : 1.0f;
-        } else if (encoding_ == Encoding::Raw) {
-            x = std::copy_n(p, parameter_count_, x);
-            if (weights_.directional) *x = cosine;
-        } else {
-            encode_layered3(p, cosine, x);
-        }
+    // The ranges of all outputs, of instance after instance; shares of the blend lie in 0 .. 1.
+    void lay_out_ranges() {
+        const int count = network_.output_stride();
+        ranges_memory_ = detail::aligned<float>(4 * static_cast<std::size_t>(count));
+        float *low = ranges_memory_.get(), *span = low + count, *log = span + count, *in_plane = log + count;
+        ranges_ = {count, false, low, span, log, in_plane};
+        int next = 0;
+        for (int k = 0; k < weights_.instances; ++k)
+            for (const TargetParam& p : weights_.target)
+                for (int c = 0; c < p.size; ++c, ++next) {
+                    low[next] = static_cast<float>(p.low);
+                    span[next] = static_cast<float>(p.logarithmic ? std::log(p.high / p.low) : p.high - p.low);
+                    log[next] = p.logarithmic;
+                    in_plane[next] = p.in_plane;
+                    ranges_.any_log |= p.logarithmic;
+                }
+        std::fill(span + next, span + count, 1.0f);
     }
 
-    void encode_layered3(const float* p, float cosine, float* x) const {
+    void outputs_of_block(int count, const float* parameters, const float* cos_theta_i, float* outputs) const {
+        alignas(64) float inputs[BLOCK * WIDEST_LAYER];
+        for (int q = 0; q < count; ++q) encode(parameters + q * parameter_count_, cos_theta_i[q], inputs + q * network_.input_stride());
+        network_.forward_many(count, inputs, outputs);
+    }
+
+    // Twin of nma/encoding.py. Inputs beyond the encoding's own, up to the network's stride, become 0.
+    void encode(const float* p, float cosine, float* x) const {
+        float* const end = x + network_.input_stride();
+        if (encoding_ == Encoding::Direction) {
+            *x++ = weights_.directional ? 2.0f * cosine - 1.0f : 1.0f;
+        } else if (encoding_ == Encoding::Raw) {
+            x = std::copy_n(p, parameter_count_, x);
+            if (weights_.directional) *x++ = cosine;
+        } else {
+            x = encode_layered3(p, cosine, x);
+        }
+        std::fill(x, end, 0.0f);
+    }
+
+    float* encode_layered3(const float* p, float cosine, float* x) const {
         constexpr float GRAZING = 0.1045f;
         const float *eta = p + 3, *k = p + 6, *albedo = p + 9;
         const float eta_top = p[2], sigma_t = p[12];
@@ -178,8 +227,14 @@ private:
         *next++ = normalised(declared[1], p[1]);
         *next++ = normalised(declared[2], eta_top);
         *next++ = normalised(declared[6], sigma_t);
-        for (const float angle : {1.0f, GRAZING})
-            for (int c = 0; c < 3; ++c) *next++ = fresnel_conductor<float>(angle, eta[c] / eta_top, k[c] / eta_top);
+        const float inside = 1.0f / eta_top;
+        for (int c = 0; c < 3; ++c) {
+            // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
+            const float n = eta[c] * inside, k2 = k[c] * inside * (k[c] * inside);
+            next[c] = ((n - 1.0f) * (n - 1.0f) + k2) / ((n + 1.0f) * (n + 1.0f) + k2);
+            next[c + 3] = fresnel_conductor<float>(GRAZING, n, k[c] * inside);
+        }
+        next += 6;
         for (int c = 0; c < 3; ++c) *next++ = albedo[c];
         if (weights_.directional) {
             const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
@@ -188,47 +243,91 @@ private:
             *next++ = std::exp(-sigma_t / maximum(cos_t, 0.05f));
         }
         for (float* unit = x; unit != next; ++unit) *unit = 2.0f * *unit - 1.0f;
+        return next;
     }
 
-    static float normalised(const SourceParam& p, float value) {
-        const float low = static_cast<float>(p.low);
-        if (p.logarithmic) return std::log(value / low) * static_cast<float>(1.0 / std::log(p.high / p.low));
-        return (value - low) / static_cast<float>(p.high - p.low);
+    static float normalised(const SourceParam& p, float value) { return ((p.logarithmic ? std::log(value) : value) - p.start) * p.per_range; }
+
+    // The material of the network's outputs, which become its numbers. Twin of nma/target/decode.py.
+    Material decoded(float* raw, float cosine) const {
+        network_.kernels_in_use().decode(ranges_, raw, 1.0f - cosine * cosine);
+        return material(raw, cosine);
     }
 
-    // Twin of nma/target/decode.py.
-    Blend<float> decode(const float* raw, float cosine) const {
-        Blend<float> made;
-        made.count = weights_.instances;
-        const float fade = 1.0f - cosine * cosine;
-        for (int k = 0; k < made.count; ++k) {
-            Principled<float>& instance = made.instances[k] = {};
-            for (const Field& field : fields_) {
-                float value = sigmoid(*raw++);
-                value = field.logarithmic ? field.low * std::exp(field.span * value) : field.low + field.span * value;
-                if (field.in_plane) value *= fade;
-                if (field.scalar) instance.*field.scalar = value;
-                else instance.base_color.*field.channel = value;
-            }
+    // From the numbers of all instances and the shares of the blend.
+    Material material(const float* numbers, float cosine) const {
+        Material made;
+        Blend<float>& blend = made.prepared_.blend;
+        blend.count = weights_.instances;
+        for (int k = 0; k < blend.count; ++k) {
+            Principled<float>& instance = blend.instances[k];
+            instance.anisotropic = instance.flatness = 0.0f;
+            for (const std::size_t offset : offsets_) std::memcpy(reinterpret_cast<char*>(&instance) + offset, numbers++, sizeof(float));
         }
         float left = 1.0f;
-        for (int k = 0; k + 1 < made.count; ++k) {
-            const float share = sigmoid(*raw++);
-            made.weights[k] = left * share;
+        for (int k = 0; k + 1 < blend.count; ++k) {
+            const float share = *numbers++;
+            blend.weights[k] = left * share;
             left *= 1.0f - share;
         }
-        made.weights[made.count - 1] = left;
+        blend.weights[blend.count - 1] = left;
+        weigh(made.prepared_, cosine, weights_.bounded);
+        made.in_plane_ = in_plane_;
         return made;
     }
 
-    static float sigmoid(float x) { return 0.5f + 0.5f * std::tanh(0.5f * x); }
-
     Weights weights_;
     Network network_;
-    std::vector<Field> fields_;
+    std::vector<std::size_t> offsets_;
+    std::unique_ptr<float[], detail::FreeAligned> ranges_memory_;
+    Ranges ranges_{};
     Encoding encoding_ = Encoding::Raw;
-    int parameter_count_ = 0;
+    int parameter_count_ = 0, output_count_ = 0;
     bool in_plane_ = false;
 };
+
+// The blends of an untextured material over cos(theta_i), interpolated between nodes: no network at the shading point.
+class Curves {
+public:
+    // As many as nma/render/curves.py has.
+    static constexpr int NODES = 128;
+
+    Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) : adapter_(&adapter), nodes_(std::max(nodes, 2)) {
+        const int stride = adapter.network_.output_stride();
+        numbers_.resize(static_cast<std::size_t>(nodes_) * stride);
+        alignas(64) float raw[WIDEST_LAYER];
+        for (int n = 0; n < nodes_; ++n) {
+            const float cosine = maximum(static_cast<float>(n) / static_cast<float>(nodes_ - 1), 1e-4f);
+            adapter.network_outputs(parameters, cosine, raw);
+            adapter.network_.kernels_in_use().decode(adapter.ranges_, raw, 1.0f - cosine * cosine);
+            std::copy_n(raw, stride, numbers_.begin() + static_cast<std::ptrdiff_t>(n) * stride);
+        }
+    }
+
+    // The adapter must outlive the curves.
+    Material at(float cos_theta_i) const {
+        const int stride = adapter_->network_.output_stride();
+        const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_ - 1);
+        const int left = std::min(static_cast<int>(position), nodes_ - 2);
+        const float t = position - static_cast<float>(left);
+        const float *a = numbers_.data() + static_cast<std::ptrdiff_t>(left) * stride, *b = a + stride;
+        float numbers[WIDEST_LAYER];
+        for (int k = 0; k < stride; ++k) numbers[k] = lerp(a[k], b[k], t);
+        return adapter_->material(numbers, cos_theta_i);
+    }
+
+private:
+    const Adapter* adapter_;
+    int nodes_;
+    std::vector<float> numbers_;
+};
+
+// Batches of `Material::eval` and `Material::sample`; `u` holds three uniform numbers for each.
+inline void eval_many(int count, const Material* materials, const Direction* wi, const Direction* wo, Value* values) {
+    for (int k = 0; k < count; ++k) values[k] = materials[k].eval(wi[k], wo[k]);
+}
+inline void sample_many(int count, const Material* materials, const Direction* wi, const float* u, Sampled* samples) {
+    for (int k = 0; k < count; ++k, u += 3) samples[k] = materials[k].sample(wi[k], u[0], u[1], u[2]);
+}
 
 }  // namespace nma

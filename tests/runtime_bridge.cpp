@@ -1,7 +1,5 @@
-// What tests/test_runtime.py calls: the runtime on arrays, in float and in double.
+// What tests/test_runtime.py calls beside the C interface: the target on arrays, in float and in double.
 #include "nma.h"
-
-#include <cstring>
 
 namespace {
 
@@ -47,34 +45,6 @@ void sample_double(int n, int count, const double* blends, const double* wi, con
         const auto s = nma::sample<double>(prepared, {wi[0], wi[1], wi[2]}, u[0], u[1], u[2]);
         const double row[] = {s.wo.x, s.wo.y, s.wo.z, s.value.x, s.value.y, s.value.z, s.pdf};
         std::copy_n(row, 7, out);
-    }
-}
-
-// An adapter from the bytes of a weights file, or null and the reason in `message`.
-nma::Adapter* adapter_new(const char* bytes, std::size_t size, char* message, std::size_t room) {
-    try {
-        return new nma::Adapter(nma::Adapter::from_memory(bytes, size));
-    } catch (const nma::Error& e) {
-        std::strncpy(message, e.what(), room - 1);
-        return nullptr;
-    }
-}
-
-void adapter_delete(nma::Adapter* adapter) { delete adapter; }
-
-void adapter_outputs(const nma::Adapter* adapter, int n, int size, const float* params, const float* cosines, float* out) {
-    float raw[nma::WIDEST_LAYER];
-    for (int i = 0; i < n; ++i, params += adapter->parameter_count(), out += size) {
-        adapter->network_outputs(params, cosines[i], raw);
-        std::copy_n(raw, size, out);
-    }
-}
-
-void adapter_evaluate(const nma::Adapter* adapter, int n, const float* params, const float* wi, const float* wo, float* out) {
-    for (int i = 0; i < n; ++i, params += adapter->parameter_count(), wi += 3, wo += 3, out += 4) {
-        const auto e = adapter->prepare(params, wi[2]).eval({wi[0], wi[1], wi[2]}, {wo[0], wo[1], wo[2]});
-        const float row[] = {e.value.x, e.value.y, e.value.z, e.pdf};
-        std::copy_n(row, 4, out);
     }
 }
 }

@@ -3,8 +3,8 @@
 #
 #     tools/setup.sh demo|test
 #
-# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM, for the tests g++) is installed with
-# apt-get where we are root on Debian or Ubuntu; otherwise the command to type is printed and we stop.
+# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM, for the tests compilers) is
+# installed with apt-get where we are root on Debian or Ubuntu; otherwise the command to type is printed and we stop.
 # PYTHON=/path/to/python3 chooses the interpreter.
 set -eu
 cd "$(dirname "$0")/.."
@@ -36,8 +36,13 @@ first_known() {
 
 # Names in Debian and Ubuntu of what the system lacks for this goal.
 missing_packages() {
-    # Tests compile the C++ runtime.
-    [ "$goal" = demo ] || command -v c++ >/dev/null || echo g++
+    # Tests compile the C++ runtime with two compilers, install it, and run it as an ARM processor would.
+    if [ "$goal" = test ]; then
+        for tool in g++ clang++:clang cmake pkg-config aarch64-linux-gnu-g++:g++-aarch64-linux-gnu \
+            qemu-aarch64-static:qemu-user-static; do
+            command -v "${tool%:*}" >/dev/null || echo "${tool#*:}"
+        done
+    fi
     "$python" -c 'import ensurepip, venv' 2>/dev/null ||
         "$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'
     # Dr.Jit's wheel for Linux links libatomic, which a minimal system lacks.

@@ -46,27 +46,34 @@ struct Prepared {
     Odds<T> odds[MAX_INSTANCES];
 };
 
-// Works out the odds at cos(theta_i), and with `bounded` dims the blend where it might reflect more than it receives.
+// Works out the odds of a blend's lobes at cos(theta_i), and with `bounded` dims it where it might reflect more light than
+// it receives.
 template <class T>
-inline Prepared<T> prepare(const Blend<T>& blend, T cos_theta_i, bool bounded) {
-    Prepared<T> made{blend, {}};
+inline void weigh(Prepared<T>& prepared, T cos_theta_i, bool bounded) {
+    Blend<T>& blend = prepared.blend;
     const T cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
     Vec3<T> albedo{T(0), T(0), T(0)};
     T total = T(0);
     for (int k = 0; k < blend.count; ++k) {
         const Albedos<T> a = lobe_albedos<T>(blend.instances[k], cosine);
         const T w = blend.weights[k];
-        made.odds[k] = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
+        Odds<T>& o = prepared.odds[k];
+        o = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
         albedo = albedo + (a.diffuse + a.spec + a.clearcoat) * w;
-        total += made.odds[k].diffuse + made.odds[k].spec + made.odds[k].clearcoat;
+        total += o.diffuse + o.spec + o.clearcoat;
     }
+    const T share = T(1) / total;
     for (int k = 0; k < blend.count; ++k) {
-        Odds<T>& o = made.odds[k];
-        o = {o.diffuse / total, o.spec / total, o.clearcoat / total};
+        Odds<T>& o = prepared.odds[k];
+        o = {o.diffuse * share, o.spec * share, o.clearcoat * share};
     }
-    if (bounded) {
-        made.blend.scale = {T(1) / maximum(albedo.x, T(1)), T(1) / maximum(albedo.y, T(1)), T(1) / maximum(albedo.z, T(1))};
-    }
+    if (bounded) blend.scale = {T(1) / maximum(albedo.x, T(1)), T(1) / maximum(albedo.y, T(1)), T(1) / maximum(albedo.z, T(1))};
+}
+
+template <class T>
+inline Prepared<T> prepare(const Blend<T>& blend, T cos_theta_i, bool bounded) {
+    Prepared<T> made{blend, {}};
+    weigh(made, cos_theta_i, bounded);
     return made;
 }
 

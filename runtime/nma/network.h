@@ -1,68 +1,114 @@
-// The multilayer perceptron: linear layers with ReLU between them, for one query at a time.
+// The multilayer perceptron: linear layers with ReLU between them, laid out for the kernels.
 #pragma once
 
+#include <memory>
+#include <new>
 #include <vector>
 
+#include "kernels.h"
 #include "weights.h"
 
 namespace nma {
 
-// Layers of at most this many inputs and outputs run; their numbers live on the stack.
-constexpr int WIDEST_LAYER = 512;
+namespace detail {
 
-// Layers with their matrices transposed, so that one input after the other adds to all neurons at once.
+struct FreeAligned {
+    void operator()(void* memory) const { ::operator delete(memory, std::align_val_t(64)); }
+};
+
+// Numbers on a boundary of 64 bytes, as vector loads want them, all 0 at first.
+template <class T>
+std::unique_ptr<T[], FreeAligned> aligned(std::size_t count) {
+    T* memory = static_cast<T*>(::operator new(count * sizeof(T), std::align_val_t(64)));
+    std::fill_n(memory, count, T(0));
+    return std::unique_ptr<T[], FreeAligned>(memory);
+}
+
+constexpr int padded(int n, int step) { return (n + step - 1) / step * step; }
+
+inline std::uint32_t bits(float value) {
+    std::uint32_t found;
+    std::memcpy(&found, &value, 4);
+    return found;
+}
+
+// The upper half of a float, rounded to nearest, ties to even.
+inline std::uint32_t bfloat16(float value) { return (bits(value) + 0x7fff + (bits(value) >> 16 & 1)) >> 16; }
+
+}  // namespace detail
+
 class Network {
 public:
     Network() = default;
 
-    explicit Network(const std::vector<Layer>& layers) {
-        for (const Layer& layer : layers) {
-            if (layer.in > WIDEST_LAYER || layer.out > WIDEST_LAYER)
-                throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
-            const int width = (layer.out + LANES - 1) / LANES * LANES;
-            Columns made{layer.in, width, std::vector<float>(static_cast<std::size_t>(layer.in + 1) * width)};
-            for (int j = 0; j < layer.out; ++j) {
-                made.values[j] = layer.bias[j];
-                for (int i = 0; i < layer.in; ++i) made.values[(i + 1) * width + j] = layer.matrix[j * layer.in + i];
-            }
-            layers_.push_back(std::move(made));
+    // Weights that are bfloat16 numbers take half the memory at no loss; avx512_bf16 rounds others to such.
+    Network(const std::vector<Layer>& layers, InstructionSet set) : kernels_(&kernels(set)) {
+        if (layers.size() > DEEPEST_NETWORK) throw Error("a network of more than " + std::to_string(DEEPEST_NETWORK) + " layers");
+        view_.depth = static_cast<int>(layers.size());
+        const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || all_bfloat16(layers);
+        int in = detail::padded(layers.front().in, INPUT_STEP);
+        for (std::size_t k = 0; k < layers.size(); ++k) {
+            if (layers[k].in > WIDEST_LAYER || layers[k].out > WIDEST_LAYER) throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
+            LayerView& view = view_.layers[k];
+            view = {in, detail::padded(layers[k].out, WIDTH_STEP), nullptr, nullptr, nullptr};
+            view.bias = keep(layers[k].bias, view.width);
+            if (pairs) view.pairs = keep_pairs(layers[k], view);
+            else view.columns = keep_columns(layers[k], view);
+            in = view.width;
         }
     }
 
-    // `outputs` has room for WIDEST_LAYER numbers, and may hold more than the last layer's after the call.
-    void forward(const float* inputs, float* outputs) const {
-        alignas(64) float buffers[2][WIDEST_LAYER];
-        const float* x = inputs;
-        for (std::size_t k = 0; k < layers_.size(); ++k) {
-            const bool last = k + 1 == layers_.size();
-            float* y = last ? outputs : buffers[k % 2];
-            linear(layers_[k], x, y);
-            if (!last)
-                for (int j = 0; j < layers_[k].width; ++j) y[j] = y[j] > 0.0f ? y[j] : 0.0f;
-            x = y;
-        }
+    InstructionSet instruction_set() const { return kernels_->set; }
+    const Kernels& kernels_in_use() const { return *kernels_; }
+
+    // Rows of inputs and outputs have room for these many numbers; inputs beyond the network's own are 0.
+    int input_stride() const { return view_.layers[0].in; }
+    int output_stride() const { return view_.layers[view_.depth - 1].width; }
+
+    // `outputs` is aligned to 64 bytes.
+    void forward(const float* inputs, float* outputs) const { kernels_->forward(view_, inputs, outputs); }
+    void forward_many(int queries, const float* inputs, float* outputs) const {
+        kernels_->forward_many(view_, queries, inputs, input_stride(), outputs, output_stride());
     }
 
 private:
-    static constexpr int LANES = 16;
-
-    // The bias, then one column of the matrix for each input, padded with zeros to whole vectors.
-    struct Columns {
-        int in, width;
-        std::vector<float> values;
-    };
-
-    static void linear(const Columns& layer, const float* x, float* y) {
-        const float* column = layer.values.data();
-        for (int j = 0; j < layer.width; ++j) y[j] = column[j];
-        for (int i = 0; i < layer.in; ++i) {
-            column += layer.width;
-            const float factor = x[i];
-            for (int j = 0; j < layer.width; ++j) y[j] += factor * column[j];
-        }
+    static bool all_bfloat16(const std::vector<Layer>& layers) {
+        for (const Layer& layer : layers)
+            for (const float w : layer.matrix)
+                if (detail::bits(w) & 0xffff) return false;
+        return true;
     }
 
-    std::vector<Columns> layers_;
+    template <class T>
+    T* room(std::vector<std::unique_ptr<T[], detail::FreeAligned>>& kept, std::size_t count) {
+        kept.push_back(detail::aligned<T>(count));
+        return kept.back().get();
+    }
+
+    const float* keep(const std::vector<float>& values, int width) {
+        float* to = room(floats_, width);
+        std::copy(values.begin(), values.end(), to);
+        return to;
+    }
+
+    const float* keep_columns(const Layer& layer, const LayerView& view) {
+        float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
+        for (int j = 0; j < layer.out; ++j)
+            for (int i = 0; i < layer.in; ++i) to[i * view.width + j] = layer.matrix[j * layer.in + i];
+        return to;
+    }
+
+    const std::uint32_t* keep_pairs(const Layer& layer, const LayerView& view) {
+        std::uint32_t* to = room(pairs_, static_cast<std::size_t>(view.in / 2) * view.width);
+        for (int j = 0; j < layer.out; ++j)
+            for (int i = 0; i < layer.in; ++i) to[i / 2 * view.width + j] |= detail::bfloat16(layer.matrix[j * layer.in + i]) << 16 * (i % 2);
+        return to;
+    }
+
+    const Kernels* kernels_ = nullptr;
+    NetworkView view_{};
+    std::vector<std::unique_ptr<float[], detail::FreeAligned>> floats_;
+    std::vector<std::unique_ptr<std::uint32_t[], detail::FreeAligned>> pairs_;
 };
 
 }  // namespace nma

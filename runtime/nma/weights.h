@@ -31,6 +31,8 @@ struct SourceParam {
     int size = 1;
     bool logarithmic = false;
     double low = 0.0, high = 0.0;  // 0 where the file states none
+    // (value - start) per_range lies in 0 .. 1 over the range, of the logarithm for a logarithmic one.
+    float start = 0.0f, per_range = 1.0f;
 };
 
 struct Weights {
@@ -116,6 +118,11 @@ inline SourceParam source_param(const Json& entry) {
     p.logarithmic = entry.at("law", Json::Kind::String).string == "log10";
     p.low = number_or_zero(entry, "low");
     p.high = number_or_zero(entry, "high");
+    if (p.logarithmic && !(p.low > 0)) throw Error("parameter '" + p.name + "' has no valid range");
+    if (p.low < p.high) {
+        p.start = static_cast<float>(p.logarithmic ? std::log(p.low) : p.low);
+        p.per_range = static_cast<float>(1.0 / (p.logarithmic ? std::log(p.high / p.low) : p.high - p.low));
+    }
     return p;
 }
 

@@ -1,0 +1,109 @@
+// The kernels, compiled once for each instruction set inside its namespace. No include guard: that is the point.
+//
+// Before it stand NMA_FN (attributes of a function for this instruction set), NMA_OP (the same, always inlined), NMA_UNROLL,
+// Vec (LANES floats) with load, store, set, add, mul, fma (a b + c), div, max, min, nearest (round to whole), power (2^whole),
+// even and odd (floats from the low and high halves of a pair), and the sizes of tiles: SINGLE_TILE vectors of neurons
+// for one query, BATCH_TILE vectors for each of BATCH_QUERIES.
+
+// `VECTORS` vectors of neurons from `first` on, for QUERIES queries. A neuron's sum is kept as SUMS sums: in a single one
+// each multiplication would wait for the one before it.
+template <int VECTORS, int QUERIES, int SUMS, bool PAIRS>
+NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride, bool relu) {
+    Vec sums[SUMS][QUERIES][VECTORS];
+    NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
+        sums[0][q][v] = load(layer.bias + first + v * LANES);
+        NMA_UNROLL for (int s = 1; s < SUMS; ++s) sums[s][q][v] = set(0.0f);
+    }
+    const float* column = PAIRS ? nullptr : layer.columns + first;
+    const std::uint32_t* pair = PAIRS ? layer.pairs + first : nullptr;
+    for (int i = 0; i < layer.in; i += INPUT_STEP) {
+        NMA_UNROLL for (int k = 0; k < INPUT_STEP; k += PAIRS ? 2 : 1) {
+            if constexpr (PAIRS) {
+                Vec weights[2][VECTORS];
+                NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
+                    weights[0][v] = even(pair + v * LANES);
+                    weights[1][v] = odd(pair + v * LANES);
+                }
+                NMA_UNROLL for (int half = 0; half < 2; ++half) NMA_UNROLL for (int q = 0; q < QUERIES; ++q) {
+                    const Vec input = set(x[q * x_stride + i + k + half]);
+                    NMA_UNROLL for (int v = 0; v < VECTORS; ++v)
+                        sums[(k + half) % SUMS][q][v] = fma(input, weights[half][v], sums[(k + half) % SUMS][q][v]);
+                }
+                pair += layer.width;
+            } else {
+                Vec weights[VECTORS];
+                NMA_UNROLL for (int v = 0; v < VECTORS; ++v) weights[v] = load(column + v * LANES);
+                NMA_UNROLL for (int q = 0; q < QUERIES; ++q) {
+                    const Vec input = set(x[q * x_stride + i + k]);
+                    NMA_UNROLL for (int v = 0; v < VECTORS; ++v) sums[k % SUMS][q][v] = fma(input, weights[v], sums[k % SUMS][q][v]);
+                }
+                column += layer.width;
+            }
+        }
+    }
+    NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
+        Vec sum = sums[0][q][v];
+        NMA_UNROLL for (int s = 1; s < SUMS; ++s) sum = add(sum, sums[s][q][v]);
+        store(y + q * y_stride + first + v * LANES, relu ? max(sum, set(0.0f)) : sum);
+    }
+}
+
+// All neurons of a layer in tiles of VECTORS, what is left in halves.
+template <int VECTORS, int QUERIES, bool PAIRS>
+NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride, bool relu) {
+    constexpr int SUMS = QUERIES > 1 || VECTORS >= 8 ? 1 : VECTORS >= 4 ? 2 : 4;
+    for (; first + VECTORS * LANES <= layer.width; first += VECTORS * LANES)
+        tile<VECTORS, QUERIES, SUMS, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
+    if constexpr (VECTORS * LANES > WIDTH_STEP)
+        if (first < layer.width) tiles<VECTORS / 2, QUERIES, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
+}
+
+template <int VECTORS, int QUERIES>
+NMA_FN inline void network(const NetworkView& view, const float* x, int x_stride, float* outputs, int output_stride) {
+    alignas(64) float buffers[2][QUERIES * WIDEST_LAYER];
+    for (int k = 0; k < view.depth; ++k) {
+        const LayerView& layer = view.layers[k];
+        const bool last = k + 1 == view.depth;
+        float* y = last ? outputs : buffers[k % 2];
+        const int y_stride = last ? output_stride : layer.width;
+        if (layer.pairs) tiles<VECTORS, QUERIES, true>(layer, 0, x, x_stride, y, y_stride, !last);
+        else tiles<VECTORS, QUERIES, false>(layer, 0, x, x_stride, y, y_stride, !last);
+        x = y;
+        x_stride = y_stride;
+    }
+}
+
+NMA_FN inline void forward(const NetworkView& view, const float* inputs, float* outputs) { network<SINGLE_TILE, 1>(view, inputs, 0, outputs, 0); }
+
+NMA_FN inline void forward_many(const NetworkView& view, int queries, const float* inputs, int input_stride, float* outputs, int output_stride) {
+    int q = 0;
+    for (; q + BATCH_QUERIES <= queries; q += BATCH_QUERIES)
+        network<BATCH_TILE, BATCH_QUERIES>(view, inputs + q * input_stride, input_stride, outputs + q * output_stride, output_stride);
+    for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
+}
+
+// e^x for |x| <= 87 to two units in the last place: 2^n times the series of the rest, which is at most log(2) / 2.
+NMA_OP Vec exponential(Vec x) {
+    const Vec n = nearest(mul(x, set(1.44269504f)));
+    // log(2) in two parts, of which the first one times n is exact.
+    const Vec r = fma(n, set(-1.42860677e-6f), fma(n, set(-0.693145752f), x));
+    Vec sum = set(1.0f / 5040.0f);
+    for (const float c : {1.0f / 720.0f, 1.0f / 120.0f, 1.0f / 24.0f, 1.0f / 6.0f, 0.5f, 1.0f, 1.0f}) sum = fma(sum, r, set(c));
+    return mul(sum, power(n));
+}
+
+NMA_FN inline void decode(const Ranges& ranges, float* raw, float fade) {
+    const Vec one = set(1.0f);
+    for (int k = 0; k < ranges.count; k += LANES) {
+        const Vec x = max(min(load(raw + k), set(80.0f)), set(-80.0f));
+        const Vec unit = div(one, add(one, exponential(mul(x, set(-1.0f)))));
+        const Vec low = load(ranges.low + k), step = mul(load(ranges.span + k), unit);
+        Vec value = add(low, step);
+        if (ranges.any_log) {
+            const Vec is_log = load(ranges.log + k);
+            const Vec power_law = mul(low, exponential(mul(is_log, step)));
+            value = fma(is_log, add(power_law, mul(value, set(-1.0f))), value);
+        }
+        store(raw + k, mul(value, fma(load(ranges.in_plane + k), set(fade - 1.0f), one)));
+    }
+}

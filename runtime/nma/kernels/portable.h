@@ -1,0 +1,70 @@
+// Four lanes of plain C++, which compilers turn into the vectors of their target.
+#pragma once
+
+#include <cmath>
+#include <cstring>
+
+#include "layout.h"
+#include "macros.h"
+
+#define NMA_FN
+#define NMA_OP NMA_INLINE
+
+namespace nma::portable {
+
+constexpr int LANES = 4, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 2;
+
+#if defined(__GNUC__)
+typedef float Vec __attribute__((vector_size(16)));
+#else
+struct Vec {
+    float lanes[LANES];
+    float& operator[](int k) { return lanes[k]; }
+    float operator[](int k) const { return lanes[k]; }
+};
+#endif
+
+template <class F>
+NMA_OP Vec each(F function) {
+    Vec r{};
+    NMA_UNROLL for (int k = 0; k < LANES; ++k) r[k] = function(k);
+    return r;
+}
+
+NMA_OP float from_bits(std::uint32_t bits) {
+    float value;
+    std::memcpy(&value, &bits, 4);
+    return value;
+}
+
+NMA_OP Vec load(const float* p) {
+    Vec v;
+    std::memcpy(&v, p, sizeof(v));
+    return v;
+}
+NMA_OP void store(float* p, Vec v) { std::memcpy(p, &v, sizeof(v)); }
+NMA_OP Vec set(float x) { return each([&](int) { return x; }); }
+#if defined(__GNUC__)
+NMA_OP Vec add(Vec a, Vec b) { return a + b; }
+NMA_OP Vec mul(Vec a, Vec b) { return a * b; }
+NMA_OP Vec div(Vec a, Vec b) { return a / b; }
+NMA_OP Vec fma(Vec a, Vec b, Vec c) { return a * b + c; }
+#else
+NMA_OP Vec add(Vec a, Vec b) { return each([&](int k) { return a[k] + b[k]; }); }
+NMA_OP Vec mul(Vec a, Vec b) { return each([&](int k) { return a[k] * b[k]; }); }
+NMA_OP Vec div(Vec a, Vec b) { return each([&](int k) { return a[k] / b[k]; }); }
+NMA_OP Vec fma(Vec a, Vec b, Vec c) { return each([&](int k) { return a[k] * b[k] + c[k]; }); }
+#endif
+NMA_OP Vec max(Vec a, Vec b) { return each([&](int k) { return a[k] > b[k] ? a[k] : b[k]; }); }
+NMA_OP Vec min(Vec a, Vec b) { return each([&](int k) { return a[k] < b[k] ? a[k] : b[k]; }); }
+NMA_OP Vec nearest(Vec x) { return each([&](int k) { return static_cast<float>(static_cast<int>(x[k] + (x[k] < 0.0f ? -0.5f : 0.5f))); }); }
+NMA_OP Vec power(Vec whole) { return each([&](int k) { return from_bits(static_cast<std::uint32_t>(static_cast<int>(whole[k]) + 127) << 23); }); }
+NMA_OP Vec even(const std::uint32_t* pairs) { return each([&](int k) { return from_bits(pairs[k] << 16); }); }
+NMA_OP Vec odd(const std::uint32_t* pairs) { return each([&](int k) { return from_bits(pairs[k] & 0xffff0000u); }); }
+
+#include "body.inl"
+
+}  // namespace nma::portable
+
+#undef NMA_FN
+#undef NMA_OP

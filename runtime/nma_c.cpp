@@ -1,0 +1,97 @@
+#include "nma_c.h"
+
+#include <cstring>
+#include <new>
+
+#include "nma.h"
+
+struct nma_adapter {
+    nma::Adapter adapter;
+};
+struct nma_curves {
+    nma::Curves curves;
+};
+
+static_assert(sizeof(nma::Material) <= sizeof(nma_material) && alignof(nma::Material) <= alignof(nma_material));
+static_assert(std::is_trivially_copyable_v<nma::Material>);
+
+namespace {
+
+const nma::Material& of(const nma_material& material) { return *std::launder(reinterpret_cast<const nma::Material*>(&material)); }
+void put(nma_material* to, const nma::Material& material) { new (to) nma::Material(material); }
+nma::Direction direction(const float* v) { return {v[0], v[1], v[2]}; }
+
+// What `make` returns, or null with the reason in `message`.
+template <class F>
+nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
+    const auto fail = [&](const char* reason) -> nma_adapter* {
+        if (message && size) {
+            std::strncpy(message, reason, size - 1);
+            message[size - 1] = '\0';
+        }
+        return nullptr;
+    };
+    if (instruction_set < NMA_FASTEST || instruction_set > NMA_AVX512_BF16) return fail("no such instruction set");
+    nma::Options options;
+    if (instruction_set != NMA_FASTEST) options.set = static_cast<nma::InstructionSet>(instruction_set);
+    try {
+        return new nma_adapter{make(options)};
+    } catch (const std::exception& e) {
+        return fail(e.what());
+    }
+}
+
+}  // namespace
+
+int nma_supported(int set) { return set >= 0 && set <= NMA_AVX512_BF16 && nma::supported(static_cast<nma::InstructionSet>(set)); }
+
+nma_adapter* nma_load(const char* path, int set, char* message, size_t size) {
+    return loaded([&](const nma::Options& options) { return nma::Adapter::load(path, options); }, set, message, size);
+}
+
+nma_adapter* nma_from_memory(const void* bytes, size_t length, int set, char* message, size_t size) {
+    return loaded([&](const nma::Options& options) { return nma::Adapter::from_memory(bytes, length, options); }, set, message, size);
+}
+
+void nma_free(nma_adapter* adapter) { delete adapter; }
+
+int nma_parameter_count(const nma_adapter* a) { return a->adapter.parameter_count(); }
+int nma_output_count(const nma_adapter* a) { return a->adapter.output_count(); }
+int nma_instruction_set(const nma_adapter* a) { return static_cast<int>(a->adapter.instruction_set()); }
+
+void nma_prepare(const nma_adapter* a, const float* parameters, float cos_theta_i, nma_material* material) {
+    put(material, a->adapter.prepare(parameters, cos_theta_i));
+}
+
+void nma_prepare_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i, nma_material* materials) {
+    nma::Material block[nma::Adapter::BLOCK];
+    for (int first = 0; first < count; first += nma::Adapter::BLOCK) {
+        const int now = std::min(nma::Adapter::BLOCK, count - first);
+        a->adapter.prepare_many(now, parameters + static_cast<size_t>(first) * a->adapter.parameter_count(), cos_theta_i + first, block);
+        for (int k = 0; k < now; ++k) put(materials + first + k, block[k]);
+    }
+}
+
+void nma_outputs_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i, float* outputs) {
+    a->adapter.network_outputs_many(count, parameters, cos_theta_i, outputs);
+}
+
+nma_curves* nma_curves_new(const nma_adapter* a, const float* parameters) { return new (std::nothrow) nma_curves{nma::Curves(a->adapter, parameters)}; }
+void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material) { put(material, curves->curves.at(cos_theta_i)); }
+void nma_curves_free(nma_curves* curves) { delete curves; }
+
+void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* out) {
+    for (int k = 0; k < count; ++k, wi += 3, wo += 3, out += 4) {
+        const nma::Value e = of(materials[k]).eval(direction(wi), direction(wo));
+        const float row[] = {e.value.x, e.value.y, e.value.z, e.pdf};
+        std::copy_n(row, 4, out);
+    }
+}
+
+void nma_sample(int count, const nma_material* materials, const float* wi, const float* u, float* out) {
+    for (int k = 0; k < count; ++k, wi += 3, u += 3, out += 7) {
+        const nma::Sampled s = of(materials[k]).sample(direction(wi), u[0], u[1], u[2]);
+        const float row[] = {s.wo.x, s.wo.y, s.wo.z, s.value.x, s.value.y, s.value.z, s.pdf};
+        std::copy_n(row, 7, out);
+    }
+}

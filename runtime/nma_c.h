@@ -1,0 +1,63 @@
+/* Neural Material Adapter for C, and for whatever calls C: see nma.h for what the functions do.
+ *
+ * Compile nma_c.cpp beside your code, or link the library nma_c. Pointers are to arrays of floats; directions are unit
+ * vectors in the local frame, z up. An adapter may be shared by threads. Only loading can fail: it returns NULL and says
+ * why in `message`. */
+#ifndef NMA_C_H
+#define NMA_C_H
+
+#include <stddef.h>
+
+#if defined(_WIN32) && defined(NMA_C_SHARED)
+#define NMA_C_API __declspec(dllexport)
+#elif defined(__GNUC__)
+#define NMA_C_API __attribute__((visibility("default")))
+#else
+#define NMA_C_API
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef struct nma_adapter nma_adapter;
+typedef struct nma_curves nma_curves;
+
+/* A material at one shading point. */
+typedef struct {
+    float opaque[96];
+} nma_material;
+
+/* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. */
+enum { NMA_FASTEST = -1, NMA_PORTABLE, NMA_NEON, NMA_AVX2, NMA_AVX512, NMA_AVX512_BF16 };
+NMA_C_API int nma_supported(int instruction_set);
+
+NMA_C_API nma_adapter* nma_load(const char* path, int instruction_set, char* message, size_t message_size);
+NMA_C_API nma_adapter* nma_from_memory(const void* bytes, size_t size, int instruction_set, char* message, size_t message_size);
+NMA_C_API void nma_free(nma_adapter* adapter);
+
+NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
+NMA_C_API int nma_output_count(const nma_adapter* adapter);
+NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
+
+NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i, nma_material* material);
+NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, nma_material* materials);
+
+/* Raw outputs of the network, `nma_output_count` for each query. */
+NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, float* outputs);
+
+/* Curves of an untextured material; the adapter must outlive them. */
+NMA_C_API nma_curves* nma_curves_new(const nma_adapter* adapter, const float* parameters);
+NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material);
+NMA_C_API void nma_curves_free(nma_curves* curves);
+
+/* For each material: `value_pdf` gets f cos(theta_o) [1/sr] as RGB and the density [1/sr]; `wo_value_pdf` a direction
+ * before them, drawn with three uniform numbers in [0, 1) from `u`. A density of 0 marks an invalid direction. */
+NMA_C_API void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* value_pdf);
+NMA_C_API void nma_sample(int count, const nma_material* materials, const float* wi, const float* u, float* wo_value_pdf);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

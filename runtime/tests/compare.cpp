@@ -1,0 +1,64 @@
+// The network on every instruction set of this CPU against the portable code.
+//
+//     c++ -std=c++17 -O2 -Iruntime runtime/tests/compare.cpp -o compare
+//     ./compare WEIGHTS
+#include "nma.h"
+
+#include <cstdio>
+#include <random>
+
+namespace {
+
+constexpr int QUERIES = 1000;
+
+std::vector<float> outputs(const nma::Adapter& adapter, const std::vector<float>& parameters, const std::vector<float>& cosines, bool batch) {
+    std::vector<float> found(static_cast<std::size_t>(QUERIES) * adapter.output_count());
+    if (batch) adapter.network_outputs_many(QUERIES, parameters.data(), cosines.data(), found.data());
+    else
+        for (int q = 0; q < QUERIES; ++q) {
+            alignas(64) float raw[nma::WIDEST_LAYER];
+            adapter.network_outputs(&parameters[static_cast<std::size_t>(q) * adapter.parameter_count()], cosines[q], raw);
+            std::copy_n(raw, adapter.output_count(), &found[static_cast<std::size_t>(q) * adapter.output_count()]);
+        }
+    return found;
+}
+
+}  // namespace
+
+int main(int count, char** words) {
+    if (count != 2) {
+        std::fprintf(stderr, "usage: %s WEIGHTS\n", words[0]);
+        return 2;
+    }
+    const nma::Adapter portable = nma::Adapter::load(words[1], {nma::InstructionSet::portable});
+    std::mt19937 engine(1);
+    std::uniform_real_distribution<float> uniform;
+    std::vector<float> parameters, cosines;
+    for (int q = 0; q < QUERIES; ++q) {
+        cosines.push_back(uniform(engine));
+        for (const nma::SourceParam& p : portable.parameters())
+            for (int c = 0; c < p.size; ++c) parameters.push_back(static_cast<float>(p.low + (p.high - p.low) * uniform(engine)));
+    }
+    const std::vector<float> wanted = outputs(portable, parameters, cosines, false);
+    bool fine = true;
+    for (const nma::InstructionSet set : nma::INSTRUCTION_SETS) {
+        if (!nma::supported(set)) continue;
+        const nma::Adapter adapter = nma::Adapter::load(words[1], {set});
+        for (const bool batch : {false, true}) {
+            const std::vector<float> found = outputs(adapter, parameters, cosines, batch);
+            double worst = 0.0, squares = 0.0;
+            for (std::size_t k = 0; k < wanted.size(); ++k) {
+                const double error = std::abs(found[k] - wanted[k]) / (1.0 + std::abs(wanted[k]));
+                worst = std::max(worst, error);
+                squares += error * error;
+            }
+            // bfloat16 keeps 8 bits of each activation; float32 sums in another order differ by roundings of their terms,
+            // which are larger than the outputs.
+            const bool rounded = set == nma::InstructionSet::avx512_bf16;
+            const double rms = std::sqrt(squares / static_cast<double>(wanted.size()));
+            fine &= rounded ? rms < 0.02 : rms < 1e-6 && worst < 3e-5;
+            std::printf("%-11s %s  worst %.1e  rms %.1e, relative to 1 + |output|\n", nma::name(set), batch ? "batch" : "single", worst, rms);
+        }
+    }
+    return fine ? 0 : 1;
+}
