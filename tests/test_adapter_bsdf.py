@@ -347,7 +347,7 @@ def test_missing_inputs_are_named(weights):
 
 
 def test_other_variants_are_refused(weights):
-    for variant in ("scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono"):
+    for variant in ("scalar_spectral", "llvm_ad_spectral", "llvm_ad_mono"):
         mi.set_variant(variant)
         assert f"not in {variant}" in load_error(description(weights))
 

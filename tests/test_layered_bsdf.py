@@ -148,7 +148,7 @@ def test_missing_inputs_are_named():
 
 
 def test_other_variants_are_refused():
-    for variant in ("scalar_rgb", "llvm_ad_spectral"):
+    for variant in ("scalar_spectral", "llvm_ad_spectral"):
         mi.set_variant(variant)
         assert f"not in {variant}" in load_error(LACQUER)
 

@@ -17,6 +17,7 @@ from target_cases import random_blend, random_directions, stacked
 
 import nma
 from nma import encoding, network, target
+from nma.export.classes import classes
 from nma.export.cpp import cpp, print_function
 from nma.export.functions import Unsupported, parsed
 from nma.ops import Vec3
@@ -317,8 +318,9 @@ def test_files_that_make_no_sense_are_refused(library, data, message):
         assert message in loaded.message
 
 
-def test_the_generated_header_is_that_of_the_present_target():
+def test_the_generated_headers_are_those_of_the_present_package():
     assert (ROOT / "runtime/nma/target.h").read_text() == cpp(), "run `python -m nma.export`"
+    assert (ROOT / "runtime/nma/classes.h").read_text() == classes(), "run `python -m nma.export`"
 
 
 def module_of(text, path: Path) -> ModuleType:

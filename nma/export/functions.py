@@ -28,7 +28,10 @@ STRUCTURES: tuple[type, ...] = (
 # Callers stand after what they call.
 FUNCTIONS: tuple[Callable, ...] = (
     microfacet.ggx_d,
+    microfacet.smith_g1,
+    microfacet.visible_normal_pdf,
     microfacet.reflect,
+    microfacet.refract,
     microfacet.sample_visible_normal,
     microfacet.fresnel_dielectric,
     microfacet.fresnel_conductor,

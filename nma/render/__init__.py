@@ -10,6 +10,7 @@ They exist in the variant in use and in every one chosen later, so the order of 
 
 from __future__ import annotations
 
+from nma import native
 from nma.errors import ParamError
 from nma.jit import dr
 from nma.llvm import ensure_llvm
@@ -24,11 +25,12 @@ def use(variant: str = "auto") -> str:
     """Choose Mitsuba's variant, and return its name.
 
     Args:
-        variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb.
+        variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb. The
+            plugins for scalar_rgb are compiled when it is first chosen.
 
     Raises:
         ParamError: Mitsuba has no such variant.
-        MissingDependencyError: the variant needs libLLVM, and it is missing or too old.
+        MissingDependencyError: the variant needs libLLVM, and it is missing or too old; or a C++ compiler.
     """
     import mitsuba as mi
 
@@ -38,5 +40,7 @@ def use(variant: str = "auto") -> str:
         raise ParamError(f"Mitsuba has no variant {variant!r}; it has {', '.join(mi.variants())}")
     if variant.startswith("llvm"):
         ensure_llvm()
+    if variant == "scalar_rgb":
+        native.build_mitsuba()
     mi.set_variant(variant)
     return variant

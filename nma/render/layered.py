@@ -118,7 +118,8 @@ def check_variant(variant: str, plugin: str) -> None:
     if not variant.endswith("_ad_rgb"):
         raise ParamError(
             f"BSDF '{plugin}' runs in the variants llvm_ad_rgb and cuda_ad_rgb, not in {variant}: its parameters are "
-            "RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first"
+            "RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for "
+            "scalar_rgb with `nma mitsuba build`"
         )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 
+from nma import native
+
 # Name of the plugin, and the module whose `define()` makes its class for the present variant.
 PLUGINS = {
     "layered": "nma.render.layered",
@@ -16,7 +18,8 @@ _registered = False
 def register() -> None:
     """Registers the plugins now, if a variant is set, and again after every `mi.set_variant`. Harmless to repeat.
 
-    Mitsuba keeps Python plugins per variant. The `mitsuba` executable does not see them; `nma render` reads XML scenes.
+    Mitsuba keeps Python plugins per variant. For scalar_rgb and the `mitsuba` executable there are compiled ones: `nma
+    mitsuba build`.
     """
     global _registered
     import mitsuba as mi
@@ -32,5 +35,18 @@ def register() -> None:
 def _on_variant(old: str | None, new: str) -> None:
     import mitsuba as mi
 
+    if new == "scalar_rgb" and native.has_mitsuba_plugins():
+        # Python ones of the same name would hide them.
+        _add_resource(str(native.mitsuba_folder()))
+        return
     for name, module in PLUGINS.items():
         mi.register_bsdf(name, importlib.import_module(module).define())
+
+
+def _add_resource(folder: str) -> None:
+    """Puts a folder on Mitsuba's resource path, once."""
+    import mitsuba as mi
+
+    resources = mi.file_resolver()
+    if folder not in [str(path) for path in resources]:
+        resources.append(folder)

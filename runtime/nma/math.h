@@ -21,6 +21,7 @@ template <class T> inline T maximum(T a, T b) { return a < b ? b : a; }
 template <class T> inline T clip(T x, T low, T high) { return minimum(maximum(x, low), high); }
 template <class T> inline T select(bool condition, T a, T b) { return condition ? a : b; }
 template <class T> inline T lerp(T a, T b, T t) { return a + (b - a) * t; }
+template <class T> inline T absolute(T x) { return x < T(0) ? -x : x; }
 template <class T> inline T safe_sqrt(T x) { return x > T(0) ? sqrt(x) : T(0); }
 
 // A direction or an RGB colour.
@@ -31,6 +32,7 @@ struct Vec3 {
 
 template <class T> inline Vec3<T> operator+(const Vec3<T>& a, const Vec3<T>& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <class T> inline Vec3<T> operator-(const Vec3<T>& a, const Vec3<T>& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class T> inline Vec3<T> operator-(const Vec3<T>& a) { return {-a.x, -a.y, -a.z}; }
 template <class T> inline Vec3<T> operator*(const Vec3<T>& a, const Vec3<T>& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 template <class T> inline Vec3<T> operator*(const Vec3<T>& a, T t) { return {a.x * t, a.y * t, a.z * t}; }
 template <class T> inline Vec3<T> operator+(const Vec3<T>& a, T t) { return {a.x + t, a.y + t, a.z + t}; }

@@ -82,10 +82,32 @@ inline T ggx_d(const Vec3<T>& m, T alpha_x, T alpha_y) {
     return T(1.0) / (PI<T> * alpha_x * alpha_y * e * e);
 }
 
+// Fraction of microfacets seen from direction `v` (either side): Smith masking. Heitz 2014, eq. 72 and 86.
+template <class T>
+inline T smith_g1(const Vec3<T>& v, T alpha_x, T alpha_y) {
+    const auto sx = alpha_x * v.x;
+    const auto sy = alpha_y * v.y;
+    const auto z2 = v.z * v.z;
+    return T(2.0) * absolute(v.z) / (absolute(v.z) + sqrt(z2 + sx * sx + sy * sy));
+}
+
+// Density of normals `m` as seen from `wi` (wi.z > 0) [1/sr]. Heitz 2018, eq. 1.
+template <class T>
+inline T visible_normal_pdf(const Vec3<T>& wi, const Vec3<T>& m, T alpha_x, T alpha_y) {
+    const auto visible = maximum(dot(wi, m), T(0.0));
+    return smith_g1<T>(wi, alpha_x, alpha_y) * ggx_d<T>(m, alpha_x, alpha_y) * visible / wi.z;
+}
+
 // Mirror image of `w` about the normal `m`.
 template <class T>
 inline Vec3<T> reflect(const Vec3<T>& w, const Vec3<T>& m) {
     return m * (T(2.0) * dot(w, m)) - w;
+}
+
+// Direction beyond the facet `m` for `w` on its side (w.m > 0). Walter 2007, eq. 40.
+template <class T>
+inline Vec3<T> refract(const Vec3<T>& w, const Vec3<T>& m, T cos_t, T eta) {
+    return m * (dot(w, m) / eta - cos_t) - w * (T(1.0) / eta);
 }
 
 // Draws a normal from `visible_normal_pdf`, wi.z > 0. Dupuy and Benyoub 2023, listing 1 (spherical caps).

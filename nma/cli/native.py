@@ -1,0 +1,25 @@
+"""`nma mitsuba`: the plugins of the scalar renderer."""
+
+from __future__ import annotations
+
+import typer
+
+from nma.cli import console
+
+mitsuba = typer.Typer(no_args_is_help=True, help="Plugins for Mitsuba's scalar renderer and its executable.")
+
+
+def register(app: typer.Typer) -> None:
+    app.add_typer(mitsuba, name="mitsuba")
+
+
+@mitsuba.command()
+def build() -> None:
+    """Compile the BSDFs nma and layered for scalar_rgb against the installed Mitsuba, some ten seconds, once."""
+    from nma import native
+
+    folder = native.build_mitsuba(console.err.print)
+    console.err.print(
+        f'In Python: nma.render.use("scalar_rgb"). On the command line: mitsuba -a {folder} -m scalar_rgb SCENE.xml'
+    )
+    print(folder)

@@ -1,0 +1,162 @@
+"""The C++ runtime, compiled on this machine when it is wanted: plugins for Mitsuba's scalar renderer, and the library
+that Python calls for many queries at once.
+
+What is built lies in the user's cache, in a folder named by the digest of the sources and of all versions that matter:
+a newer package or Mitsuba builds anew and never loads what does not fit it. Compilers: `CXX`, else c++, g++ or clang++.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from nma.errors import MissingDependencyError, NmaError
+
+PLUGINS = ("nma", "layered")
+# Those of Mitsuba's wheel. How vectors are passed depends on the instruction set: with another one, plugins load
+# and return nonsense.
+_MITSUBA_FLAGS = (
+    *(["-march=haswell"] if platform.machine() in ("x86_64", "AMD64") else []),
+    *("-std=c++20", "-O2", "-fPIC", "-shared", "-fvisibility=hidden"),
+    *("-DMI_ENABLE_CUDA=1", "-DMI_ENABLE_LLVM=1", "-DMI_ENABLE_EMBREE=1", "-DMI_ENABLE_AUTODIFF=1"),
+    "-DLITTLE_ENDIAN",
+)
+
+
+class BuildError(NmaError, RuntimeError):
+    """The compiler refused; the message holds its first words."""
+
+
+def sources() -> Path:
+    """The folder of the C++ runtime: of a checkout, or as the wheel has it."""
+    package = Path(__file__).parent
+    for folder in (package / "runtime", package.parent / "runtime"):
+        if (folder / "nma.h").exists():
+            return folder
+    raise NmaError(f"the C++ runtime is not beside {package}; install the package again")
+
+
+def mitsuba_folder() -> Path:
+    """Where the plugins for the installed Mitsuba are, or will be: a folder for its resource path."""
+    return _cache() / f"mitsuba-{_digest('mitsuba', 'drjit')}"
+
+
+def has_mitsuba_plugins() -> bool:
+    return all((mitsuba_folder() / "plugins" / f"{name}.so").exists() for name in PLUGINS)
+
+
+def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
+    """Compiles the plugins `nma` and `layered` for `scalar_rgb` against the installed Mitsuba, unless they are there.
+
+    Args:
+        say: is told of each step.
+
+    Returns:
+        The folder to put on Mitsuba's resource path; shipped adapters lie in it too.
+
+    Raises:
+        MissingDependencyError: no compiler, or no headers of nanobind, which Dr.Jit's include.
+        BuildError: the compiler refused.
+    """
+    folder = mitsuba_folder()
+    if has_mitsuba_plugins():
+        say(f"{folder} is up to date")
+        return folder
+    mitsuba, drjit, nanobind = (_package(name) for name in ("mitsuba", "drjit", "nanobind"))
+    headers = [mitsuba / "include", drjit / "include", nanobind / "include"]
+    headers.append(nanobind / "ext/robin_map/include")
+    flags = [
+        *_MITSUBA_FLAGS,
+        f"-I{sources()}",
+        f"-I{sources() / 'mitsuba'}",
+        *(f"-isystem{h}" for h in headers),
+    ]
+    flags += [f"-L{mitsuba}", f"-L{drjit}", "-lmitsuba", "-ldrjit-core", "-ldrjit-extra"]
+    flags.append("-Wl,--allow-shlib-undefined")
+
+    def make(into: Path) -> None:
+        (into / "plugins").mkdir()
+        for name in PLUGINS:
+            say(f"compiling {name}.so")
+            # Libraries come after what needs them.
+            _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", into / "plugins" / f"{name}.so"], flags)
+        shutil.copytree(Path(__file__).parent / "adapters", into / "adapters")
+
+    _whole(folder, make)
+    return folder
+
+
+def library() -> Path:
+    """The C interface as a shared library, compiled unless it is there. Raises as `build_mitsuba`."""
+    folder = _cache() / f"library-{_digest()}"
+    flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", f"-I{sources()}"]
+    _whole(folder, lambda into: _compile([sources() / "nma_c.cpp", "-o", into / "nma_c.so"], flags))
+    return folder / "nma_c.so"
+
+
+def compiler() -> str:
+    """The C++ compiler. Raises `MissingDependencyError`."""
+    for name in filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")):
+        if found := shutil.which(name):
+            return found
+    raise MissingDependencyError(
+        "no C++ compiler found; install one (Debian: sudo apt-get install g++), or name it in CXX"
+    )
+
+
+def _whole(folder: Path, make: Callable[[Path], None]) -> None:
+    """The folder as `make` fills it: all of it or nothing, whenever this is killed."""
+    if folder.exists():
+        return
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
+    try:
+        make(partial)
+        try:
+            partial.rename(folder)
+        except OSError:
+            # Another process was faster.
+            if not folder.exists():
+                raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _compile(words: Sequence[str | Path], flags: Sequence[str]) -> None:
+    command = [compiler(), *map(str, words), *flags]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    if run.returncode:
+        errors = [line for line in run.stderr.splitlines() if "error" in line] or run.stderr.splitlines()
+        raise BuildError(f"{' '.join(command[:2])}: {'; '.join(errors[:2])}")
+
+
+def _package(name: str) -> Path:
+    """The folder of an installed package."""
+    found = importlib.util.find_spec(name)
+    if found is None or not found.submodule_search_locations:
+        raise MissingDependencyError(f"the package {name} is missing; install it with: pip install {name}")
+    return Path(next(iter(found.submodule_search_locations)))
+
+
+def _cache() -> Path:
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "neural-material-adapter"
+
+
+def _digest(*packages: str) -> str:
+    """Of the sources, the shipped adapters, and the versions of these packages."""
+    digest = hashlib.sha256()
+    folders = (sources(), Path(__file__).parent / "adapters") if packages else (sources(),)
+    for file in sorted(f for folder in folders for f in folder.rglob("*") if f.is_file()):
+        digest.update(file.name.encode() + file.read_bytes())
+    for name in packages:
+        digest.update(f"{name} {importlib.metadata.version(name)}".encode())
+    return digest.hexdigest()[:16]

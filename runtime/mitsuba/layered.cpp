@@ -1,0 +1,114 @@
+// Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, the reference for its adapter. Built
+// by `nma mitsuba build`.
+//
+// `sample` is one walk, `eval` one unbiased estimate. Mitsuba gives `eval` no random numbers; it makes its own from the bits
+// of its arguments. Properties: the parameters of the class `layered3`.
+#include <mitsuba/core/random.h>
+
+#include "inputs.h"
+#include "nma/classes.h"
+#include "nma/layered.h"
+
+namespace mitsuba::nma_plugin {
+
+template <typename Float, typename Spectrum>
+class LayeredBSDF final : public BSDF<Float, Spectrum> {
+public:
+    MI_IMPORT_BASE(BSDF, m_flags, m_components)
+    MI_IMPORT_TYPES()
+
+    explicit LayeredBSDF(const Properties& props) : Base(props), inputs_(props, nma::layered3_parameters(), false) {
+        m_flags = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
+        if (inputs_.textured()) m_flags = m_flags | BSDFFlags::SpatiallyVarying;
+        m_components.push_back(m_flags);
+    }
+
+    Spectrum eval(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
+        return eval_pdf(context, si, wo, active).first;
+    }
+
+    Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
+        if (hidden(context, si)) return 0.0f;
+        const nma::layered::Layers layers = at(si);
+        return nma::layered::pdf(layers, nma::layered::Density(layers, direction(si.wi)), direction(si.wi), direction(wo));
+    }
+
+    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
+        if (hidden(context, si)) return {0.0f, 0.0f};
+        const nma::layered::Layers layers = at(si);
+        return evaluated(layers, nma::layered::Density(layers, direction(si.wi)), si, wo);
+    }
+
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u, const Point2f& u2, Mask) const override {
+        if (hidden(context, si)) return {dr::zeros<BSDFSample3f>(), 0.0f};
+        const nma::layered::Layers layers = at(si);
+        return sampled(layers, nma::layered::Density(layers, direction(si.wi)), si, u, u2);
+    }
+
+    std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Float u,
+                                                                        const Point2f& u2, Mask) const override {
+        if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
+        const nma::layered::Layers layers = at(si);
+        const nma::layered::Density density(layers, direction(si.wi));
+        const auto [value, pdf] = evaluated(layers, density, si, wo);
+        const auto [drawn, weight] = sampled(layers, density, si, u, u2);
+        return {value, pdf, drawn, weight};
+    }
+
+    std::string to_string() const override { return "Layered[\n" + inputs_.to_string() + "]"; }
+
+    MI_DECLARE_CLASS(LayeredBSDF)
+
+private:
+    static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
+        return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
+    }
+
+    nma::layered::Layers at(const SurfaceInteraction3f& si) const {
+        float numbers[13];
+        inputs_.at(si, numbers);
+        return nma::layered::Layers::of(numbers);
+    }
+
+    static nma::Vec3<float> direction(const Vector3f& v) { return {v.x(), v.y(), v.z()}; }
+
+    // A stream of random numbers that depends on the bits of `numbers`.
+    template <std::size_t N>
+    static nma::layered::Random random(const float (&numbers)[N]) {
+        std::uint32_t a = N, b = 0x9e3779b9u;
+        for (std::size_t k = 0; k < N; ++k) {
+            std::uint32_t bits;
+            std::memcpy(&bits, numbers + k, sizeof(bits));
+            (k % 2 ? b : a) ^= bits;
+            if (k % 2 || k + 1 == N) std::tie(a, b) = sample_tea_32(a, b);
+        }
+        return nma::layered::Random(static_cast<std::uint64_t>(a) << 32 | b, b);
+    }
+
+    static std::pair<Spectrum, Float> evaluated(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, const Vector3f& wo) {
+        if (!(wo.z() > 0.0f)) return {0.0f, 0.0f};
+        nma::layered::Random rng = random({wo.x(), wo.y(), wo.z(), si.wi.x(), si.wi.y(), si.wi.z(), si.p.x(), si.p.y(), si.p.z(), si.uv.x(), si.uv.y()});
+        const nma::Vec3<float> value = nma::layered::evaluate(layers, direction(si.wi), direction(wo), rng);
+        return {Spectrum(value.x, value.y, value.z), nma::layered::pdf(layers, density, direction(si.wi), direction(wo))};
+    }
+
+    static std::pair<BSDFSample3f, Spectrum> sampled(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2) {
+        nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
+        const nma::layered::Walk walk = nma::layered::walk(layers, direction(si.wi), rng);
+        const nma::Vec3<float>& t = walk.throughput;
+        BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
+        if (!(t.x > 0.0f || t.y > 0.0f || t.z > 0.0f)) return {drawn, 0.0f};
+        drawn.wo = Vector3f(walk.direction.x, walk.direction.y, walk.direction.z);
+        drawn.pdf = nma::layered::pdf(layers, density, direction(si.wi), walk.direction);
+        drawn.eta = 1.0f;
+        drawn.sampled_type = +BSDFFlags::GlossyReflection;
+        if (!(drawn.pdf > 0.0f)) return {dr::zeros<BSDFSample3f>(), 0.0f};
+        return {drawn, Spectrum(t.x, t.y, t.z)};
+    }
+
+    Inputs<Float, Spectrum> inputs_;
+};
+
+NMA_EXPORT_SCALAR_PLUGIN(LayeredBSDF)
+
+}  // namespace mitsuba::nma_plugin

@@ -1,0 +1,120 @@
+// Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material as its adapter sees it. Built by `nma mitsuba build`.
+//
+// Properties, as of the Python BSDF of the same name: `adapter`, a shipped adapter's name or a weights file; `clamp`; and
+// the parameters of the adapter's class. Beside them, `online`: whether the network also runs at every shading point of a
+// material without textures, which otherwise becomes curves over cos(theta_i) when it is loaded; and `bfloat16`: whether it
+// may round to eight bits where the CPU then takes half the time.
+#include <mitsuba/core/fresolver.h>
+
+#include "inputs.h"
+#include "nma.h"
+
+namespace mitsuba::nma_plugin {
+
+template <typename Float, typename Spectrum>
+class NmaBSDF final : public BSDF<Float, Spectrum> {
+public:
+    MI_IMPORT_BASE(BSDF, m_flags, m_components)
+    MI_IMPORT_TYPES()
+
+    explicit NmaBSDF(const Properties& props)
+        : Base(props), name_(props.get<std::string_view>("adapter", "layered3-5x64")), adapter_(load(name_, props.get<bool>("bfloat16", false))),
+          inputs_(props, adapter_.parameters(), props.get<bool>("clamp", false)) {
+        const bool online = props.get<bool>("online", false);
+        m_flags = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
+        if (inputs_.textured()) m_flags = m_flags | BSDFFlags::SpatiallyVarying;
+        m_components.push_back(m_flags);
+        if (inputs_.textured() || online) return;
+        float parameters[MOST_PARAMETERS];
+        inputs_.at(dr::zeros<SurfaceInteraction3f>(), parameters);
+        curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
+    }
+
+    Spectrum eval(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
+        return eval_pdf(context, si, wo, active).first;
+    }
+    Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
+        return eval_pdf(context, si, wo, active).second;
+    }
+
+    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
+        if (hidden(context, si)) return {0.0f, 0.0f};
+        return evaluated(prepare(si), si, wo);
+    }
+
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u, const Point2f& u2, Mask) const override {
+        if (hidden(context, si)) return {dr::zeros<BSDFSample3f>(), 0.0f};
+        return sampled(prepare(si), si, u, u2);
+    }
+
+    std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Float u,
+                                                                        const Point2f& u2, Mask) const override {
+        if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
+        const nma::Material material = prepare(si);
+        const auto [value, density] = evaluated(material, si, wo);
+        const auto [drawn, weight] = sampled(material, si, u, u2);
+        return {value, density, drawn, weight};
+    }
+
+    std::string to_string() const override { return "Nma[\n  adapter = " + name_ + ",\n" + inputs_.to_string() + "]"; }
+
+    MI_DECLARE_CLASS(NmaBSDF)
+
+private:
+    static constexpr int MOST_PARAMETERS = 64;
+
+    // Weights lie beside the scene, as the files of Mitsuba's own plugins do; shipped ones beside the plugins.
+    static nma::Adapter load(const std::string& name, bool bfloat16) {
+        const auto resolver = file_resolver();
+        auto path = resolver->resolve(name);
+        if (!fs::exists(path)) path = resolver->resolve("adapters/" + name + ".safetensors");
+        nma::Options options;
+        if (bfloat16 && nma::supported(nma::InstructionSet::avx512_bf16)) options.set = nma::InstructionSet::avx512_bf16;
+        try {
+            nma::Adapter adapter = nma::Adapter::load(fs::exists(path) ? path.string() : name, options);
+            if (adapter.parameter_count() > MOST_PARAMETERS) throw nma::Error(name + ": a class of too many parameters");
+            return adapter;
+        } catch (const nma::Error& e) {
+            Throw("%s", e.what());
+        }
+    }
+
+    static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
+        return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
+    }
+
+    nma::Material prepare(const SurfaceInteraction3f& si) const {
+        const float cosine = nma::clip(static_cast<float>(si.wi.z()), 1e-4f, 1.0f);
+        if (curves_) return curves_->at(cosine);
+        float parameters[MOST_PARAMETERS];
+        inputs_.at(si, parameters);
+        return adapter_.prepare(parameters, cosine);
+    }
+
+    static nma::Direction direction(const Vector3f& v) { return {v.x(), v.y(), v.z()}; }
+
+    static std::pair<Spectrum, Float> evaluated(const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) {
+        const nma::Value v = material.eval(direction(si.wi), direction(wo));
+        return {Spectrum(v.value.x, v.value.y, v.value.z), v.pdf};
+    }
+
+    static std::pair<BSDFSample3f, Spectrum> sampled(const nma::Material& material, const SurfaceInteraction3f& si, Float u, const Point2f& u2) {
+        const nma::Sampled s = material.sample(direction(si.wi), u, u2.x(), u2.y());
+        BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
+        if (!(s.pdf > 0.0f)) return {drawn, 0.0f};
+        drawn.wo = Vector3f(s.wo.x, s.wo.y, s.wo.z);
+        drawn.pdf = s.pdf;
+        drawn.eta = 1.0f;
+        drawn.sampled_type = +BSDFFlags::GlossyReflection;
+        return {drawn, Spectrum(s.value.x, s.value.y, s.value.z) / s.pdf};
+    }
+
+    std::string name_;
+    nma::Adapter adapter_;
+    Inputs<Float, Spectrum> inputs_;
+    std::unique_ptr<nma::Curves> curves_;
+};
+
+NMA_EXPORT_SCALAR_PLUGIN(NmaBSDF)
+
+}  // namespace mitsuba::nma_plugin

@@ -1,0 +1,330 @@
+// The layered material itself, simulated: a rough dielectric over a homogeneous medium over a rough conductor, by
+// position-free random walks. Scalar twin of nma/sources/layered.py and nma/sources/layered_eval.py; the method and its
+// sources are told there (Guo, Hasan and Zhao 2018).
+//
+// Directions are unit vectors in the local frame, z up. Values are f cos(theta_o) [1/sr], noisy; densities are per sr.
+#pragma once
+
+#include <cstdint>
+
+#include "target.h"
+
+namespace nma::layered {
+
+using Vec = Vec3<float>;
+
+// Walks whose brightest channel falls below this go on with a chance in proportion to it.
+constexpr float ROULETTE_THRESHOLD = 0.5f;
+// Chance to go on after total reflection.
+constexpr float TRAPPED_SURVIVAL = 0.999f;
+// A coat whose index is closer to 1 than this is taken as none.
+constexpr float INDEX_MATCHED = 1e-3f;
+// Share of the cosine lobe beside the others before normalisation.
+constexpr float LEAST_DIFFUSE = 0.03f;
+
+// Random numbers of O'Neill 2014, "PCG": 64 bits of state, 32 of output (XSH-RR).
+class Random {
+public:
+    Random(std::uint64_t state, std::uint64_t stream) : increment_(stream << 1 | 1) {
+        next();
+        state_ += state;
+        next();
+    }
+
+    std::uint32_t next() {
+        const std::uint64_t old = state_;
+        state_ = old * 6364136223846793005ull + increment_;
+        const std::uint32_t mixed = static_cast<std::uint32_t>((old >> 18 ^ old) >> 27), turn = static_cast<std::uint32_t>(old >> 59);
+        return mixed >> turn | mixed << (-turn & 31);
+    }
+
+    // Uniform in [0, 1).
+    float uniform() { return static_cast<float>(next() >> 8) * 0x1p-24f; }
+
+private:
+    std::uint64_t state_ = 0, increment_;
+};
+
+// The stack. Indices of the conductor are relative to the coat that it lies under.
+struct Layers {
+    float alpha_top, alpha_bottom, eta_top;
+    Vec eta_bottom, k_bottom, albedo;
+    float sigma_t;
+
+    // From the 13 numbers of the class `layered3`.
+    static Layers of(const float* p) {
+        const float eta = p[2] < 1.0f + INDEX_MATCHED ? 1.0f : p[2], inverse = 1.0f / eta;
+        return {p[0], p[1], eta, Vec{p[3], p[4], p[5]} * inverse, Vec{p[6], p[7], p[8]} * inverse, {p[9], p[10], p[11]}, p[12]};
+    }
+};
+
+// A walk: where it is heading, its throughput, and its height in the slab (1 at the top, 0 at the bottom).
+struct Walk {
+    Vec direction, throughput;
+    float height;
+    bool inside, alive;
+};
+
+namespace detail {
+
+inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)); }
+inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
+inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
+
+inline Vec conductor(float cosine, const Layers& layers) {
+    const Vec &eta = layers.eta_bottom, &k = layers.k_bottom;
+    return {fresnel_conductor<float>(cosine, eta.x, k.x), fresnel_conductor<float>(cosine, eta.y, k.y), fresnel_conductor<float>(cosine, eta.z, k.z)};
+}
+
+// Fraction that passes `depth` of the slab along `w` without meeting the medium.
+inline float transmittance(const Layers& layers, float depth, const Vec& w) {
+    return layers.sigma_t > 0.0f ? exp(-layers.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
+}
+
+// Russian roulette on the brightest channel.
+inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
+    if (exempt) return;
+    const float chance = minimum(max_component(walk.throughput) * (1.0f / ROULETTE_THRESHOLD), trapped ? TRAPPED_SURVIVAL : 1.0f);
+    if (chance < 1.0f && random.uniform() >= chance) {
+        walk.throughput = {0.0f, 0.0f, 0.0f};
+        walk.alive = false;
+        return;
+    }
+    walk.throughput = walk.throughput * (1.0f / chance);
+    walk.alive = chance > 0.0f;
+}
+
+// One free flight through a medium of `sigma_t` and one event. Returns whether the walk left.
+inline bool step(const Layers& layers, float sigma_t, Walk& walk, Random& random) {
+    const Vec d = walk.direction;
+    if (walk.inside && sigma_t > 0.0f) {
+        const float height = walk.height - d.z * (log(1.0f - random.uniform()) / sigma_t);
+        if (height > 0.0f && height < 1.0f) {
+            const float z = 1.0f - 2.0f * random.uniform(), phi = 2.0f * PI<float> * random.uniform(), r = safe_sqrt(1.0f - z * z);
+            walk.direction = {r * cos(phi), r * sin(phi), z};
+            walk.height = height;
+            walk.throughput = walk.throughput * layers.albedo;
+            roulette(walk, false, false, random);
+            return false;
+        }
+    }
+    const bool upward = walk.inside && d.z > 0.0f, at_bottom = walk.inside && !upward;
+    const float alpha = at_bottom ? layers.alpha_bottom : layers.alpha_top;
+    const Vec w{-d.x, -d.y, maximum(absolute(d.z), 1e-7f)};
+    const float u1 = random.uniform(), u2 = random.uniform();
+    const Vec m = sample_visible_normal<float>(w, alpha, alpha, u1, u2);
+    const float cos_m = maximum(dot(w, m), 0.0f);
+    Vec out;
+    bool reflects = true, trapped = false, valid;
+    if (at_bottom) {
+        out = reflect<float>(w, m);
+        valid = out.z > 0.0f;
+        walk.throughput = walk.throughput * conductor(cos_m, layers);
+    } else {
+        const float eta = upward ? 1.0f / layers.eta_top : layers.eta_top;
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cos_m, eta);
+        reflects = random.uniform() < fresnel;
+        trapped = upward && cos_t <= 0.0f;
+        out = reflects ? reflect<float>(w, m) : refract<float>(w, m, cos_t, eta);
+        valid = reflects ? out.z > 0.0f : out.z < 0.0f;
+    }
+    walk.throughput = valid ? walk.throughput * smith_g1<float>(out, alpha, alpha) : Vec{0.0f, 0.0f, 0.0f};
+    if (upward) out.z = -out.z;
+    const bool leaves = !at_bottom && out.z > 0.0f && reflects != walk.inside;
+    walk.direction = out;
+    walk.height = at_bottom ? 0.0f : 1.0f;
+    walk.inside = walk.inside || !reflects;
+    roulette(walk, leaves, trapped, random);
+    if (leaves) walk.alive = false;
+    return leaves;
+}
+
+// A walk from `w` just below the coat: all of it goes down.
+inline Walk enter(const Layers& layers, const Vec& w, Random& random) {
+    const float alpha = layers.alpha_top, u1 = random.uniform(), u2 = random.uniform();
+    const Vec view = above(w), m = sample_visible_normal<float>(view, alpha, alpha, u1, u2);
+    const auto [fresnel, cos_t] = fresnel_dielectric<float>(maximum(dot(view, m), 0.0f), layers.eta_top);
+    const Vec down = refract<float>(view, m, cos_t, layers.eta_top);
+    const float weight = down.z < 0.0f ? (1.0f - fresnel) * smith_g1<float>(down, alpha, alpha) : 0.0f;
+    return {down, {weight, weight, weight}, 1.0f, true, weight > 0.0f};
+}
+
+// A segment of a walk that met interfaces only: where it heads, and its throughput over the chance that it was kept.
+struct Way {
+    Vec direction, reached;
+};
+
+// One segment of a walk beyond its first, kept by weighted reservoir sampling (Chao 1982).
+struct Detour {
+    Vec direction, tint{0.0f, 0.0f, 0.0f};
+    float total = 0.0f;
+
+    void offer(const Walk& walk, Random& random) {
+        const float weight = walk.alive ? max_component(walk.throughput) : 0.0f;
+        total += weight;
+        if (weight > 0.0f && random.uniform() * total < weight) {
+            direction = walk.direction;
+            tint = walk.throughput * (1.0f / weight);
+        }
+    }
+};
+
+// (q, t): density of `up` when wo is refracted down by visible normals [1/sr], and density of wo given `up` over q.
+inline std::pair<float, float> out_through_coat(const Layers& layers, const Vec& wo, const Vec& up) {
+    const float alpha = layers.alpha_top, eta = layers.eta_top;
+    const bool matched = eta == 1.0f;
+    const Vec half = up * eta - wo;
+    const float length2 = maximum(dot(half, half), 1e-20f);
+    const Vec m = half * (1.0f / sqrt(length2));
+    const float cos_o = dot(wo, m), cos_up = dot(up, m);
+    if (!matched && !(m.z > 0.0f && cos_o > 0.0f && cos_up > 0.0f)) return {0.0f, 0.0f};
+    const float fresnel = matched ? 0.0f : std::get<0>(fresnel_dielectric<float>(clip(cos_o, 0.0f, 1.0f), eta));
+    const float t = (1.0f - fresnel) * smith_g1<float>(up, alpha, alpha) * wo.z / (eta * eta * maximum(up.z, 1e-7f));
+    return {matched ? 0.0f : visible_normal_pdf<float>(above(wo), m, alpha, alpha) * (eta * eta) * cos_up / length2, t};
+}
+
+// Density about a visit to the conductor [1/sr], the same for both directions in which it can be walked.
+inline float sharpness(const Layers& layers, const Vec& w_in, const Vec& up) {
+    return 0.25f * ggx_d<float>(normalize(w_in + up), layers.alpha_bottom, layers.alpha_bottom);
+}
+
+// Density of `out` when `w` is mirrored in a visible normal [1/sr].
+inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
+    const Vec m = normalize(w + out);
+    return visible_normal_pdf<float>(w, m, alpha, alpha) / (4.0f * maximum(dot(w, m), 1e-7f));
+}
+
+// Light from wi to wo that meets interfaces only, and a segment of the walk `there` after its first.
+inline Vec unscattered(const Layers& layers, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back, Random& random, bool forward, Way& detour) {
+    const Vec drawn_up = -back.direction;
+    const bool matched = layers.eta_top == 1.0f;
+    const auto [drawn_q, drawn_t] = out_through_coat(layers, wo, drawn_up);
+    const float way_in = bluntness(out_through_coat(layers, wi, -there.direction).first);
+    const float drawn_passes = drawn_t * transmittance(layers, 1.0f, drawn_up), blunt_q = bluntness(drawn_q);
+    Walk walk = there;
+    Vec total{0.0f, 0.0f, 0.0f};
+    float first = 0.0f;
+    Detour kept{there.direction};
+    while (walk.alive) {
+        Walk before = walk;
+        before.throughput = before.throughput * transmittance(layers, 1.0f, before.direction);
+        walk = before;
+        step(layers, 0.0f, walk, random);
+        kept.offer(walk, random);
+        // Only visits to the conductor send light to wo.
+        if (walk.height >= 1.0f) continue;
+        const Vec w_in = -before.direction;
+        const float rest = way_in + first;
+        // The last visit left to chance.
+        float blunt = bluntness(sharpness(layers, w_in, drawn_up));
+        float share = matched ? 1.0f : blunt / (blunt + rest + blunt_q);
+        if (!forward && !(first > 0.0f)) share = 0.0f;
+        if (share > 0.0f && drawn_passes > 0.0f) {
+            const Vec view = above(w_in);
+            const float cosine = dot(view, normalize(view + drawn_up));
+            const float weight = share * drawn_passes * mirror_pdf(view, drawn_up, layers.alpha_bottom) * smith_g1<float>(drawn_up, layers.alpha_bottom, layers.alpha_bottom);
+            total = total + before.throughput * conductor(cosine, layers) * weight;
+        }
+        // The way out left to chance.
+        blunt = bluntness(sharpness(layers, w_in, walk.direction));
+        if (!matched) {
+            const auto [q, t] = out_through_coat(layers, wo, walk.direction);
+            if (q > 0.0f && t > 0.0f) {
+                share = bluntness(q) / (bluntness(q) + blunt + rest);
+                total = total + walk.throughput * (share * q * t * transmittance(layers, 1.0f, walk.direction));
+            }
+        }
+        if (!(first > 0.0f)) first = blunt;
+    }
+    detour = {kept.direction, kept.tint * kept.total};
+    return total;
+}
+
+// Light that scatters in the medium: at each scattering, as if it were the last, it takes the ways out.
+inline Vec scattered(const Layers& layers, Walk walk, const Way (&ways)[2], Random& random) {
+    Vec total{0.0f, 0.0f, 0.0f};
+    if (!(layers.sigma_t > 0.0f)) return total;
+    while (walk.alive) {
+        const Vec arriving = walk.throughput;
+        step(layers, layers.sigma_t, walk, random);
+        if (!(walk.height > 0.0f && walk.height < 1.0f)) continue;
+        Vec out{0.0f, 0.0f, 0.0f};
+        for (const Way& way : ways) {
+            const Vec& d = way.direction;
+            const float depth = d.z < 0.0f ? 1.0f - walk.height : walk.height;
+            out = out + way.reached * (transmittance(layers, depth, d) / maximum(absolute(d.z), 1e-7f));
+        }
+        total = total + arriving * layers.albedo * out * (0.25f * INV_PI<float>);
+    }
+    return total;
+}
+
+// Where light along `w` comes from under a flat coat of index `eta`, pointing up still.
+inline Vec refract_flat(const Vec& w, float eta) {
+    const float x = w.x / eta, y = w.y / eta;
+    return {x, y, sqrt(maximum(1.0f - x * x - y * y, 1e-7f))};
+}
+
+}  // namespace detail
+
+// f cos(theta_o) of the coat's upper side alone [1/sr].
+inline float coat_reflection(const Layers& layers, const Vec& wi, const Vec& wo) {
+    const Vec m = normalize(wi + wo);
+    const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), layers.eta_top)), alpha = layers.alpha_top;
+    return fresnel * ggx_d<float>(m, alpha, alpha) * smith_g1<float>(wi, alpha, alpha) * smith_g1<float>(wo, alpha, alpha) / (4.0f * maximum(wi.z, 1e-7f));
+}
+
+// One unbiased estimate of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
+inline Vec evaluate(const Layers& layers, const Vec& wi, const Vec& wo, Random& random) {
+    Walk there = detail::enter(layers, wi, random), back = detail::enter(layers, wo, random);
+    there.alive = back.alive = there.alive && back.alive;
+    detail::Way unused{}, detour{};
+    const Vec forward = detail::unscattered(layers, wi, there, wo, back, random, true, unused);
+    const Vec backward = detail::unscattered(layers, wo, back, wi, there, random, false, detour);
+    const detail::Way ways[2] = {{back.direction, back.throughput}, detour};
+    const Vec through = detail::scattered(layers, there, ways, random);
+    const float index2 = layers.eta_top * layers.eta_top;
+    return forward + backward * (wo.z / maximum(wi.z, 1e-7f)) + through * (wo.z / index2) + coat_reflection(layers, wi, wo);
+}
+
+// One whole walk from `wi` (wi.z > 0): the direction in which it left, or a throughput of 0.
+inline Walk walk(const Layers& layers, const Vec& wi, Random& random) {
+    Walk made{-wi, {1.0f, 1.0f, 1.0f}, 1.0f, false, true};
+    bool left = false;
+    while (made.alive) left = detail::step(layers, layers.sigma_t, made, random);
+    if (!left) made.throughput = {0.0f, 0.0f, 0.0f};
+    return made;
+}
+
+// The density of `pdf` at one wi: weights of its lobes and the width of the second.
+struct Density {
+    float coat, bottom, diffuse, width;
+    Vec inside;
+
+    Density(const Layers& layers, const Vec& wi) : inside(detail::refract_flat(wi, layers.eta_top)) {
+        const float eta = layers.eta_top, cos_i = maximum(wi.z, 1e-3f);
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cos_i, eta);
+        const float crossing = layers.alpha_top * (eta * cos_t - cos_i) / (2.0f * eta * cos_t);
+        const float width2 = layers.alpha_bottom * layers.alpha_bottom + 2.0f * crossing * crossing;
+        const float critical = 1.0f / (eta + safe_sqrt(eta * eta - 1.0f)), trapped = width2 / (width2 + critical * critical);
+        const float passes = (1.0f - fresnel) * exp(-2.0f * layers.sigma_t / cos_t);
+        bottom = passes * mean(detail::conductor(cos_t, layers));
+        diffuse = LEAST_DIFFUSE + 0.5f * ((1.0f - fresnel - passes) * mean(layers.albedo) + bottom * trapped);
+        const float norm = 1.0f / (fresnel + bottom + diffuse);
+        coat = fresnel * norm;
+        bottom *= norm;
+        diffuse *= norm;
+        width = clip(sqrt(width2), 1e-4f, 1.0f);
+    }
+};
+
+// A density of wo [1/sr] near the walk's, integral at most 1, positive for wo.z > 0: for weighing estimators.
+inline float pdf(const Layers& layers, const Density& density, const Vec& wi, const Vec& wo) {
+    if (!(wo.z > 0.0f)) return 0.0f;
+    const Vec inside_o = detail::refract_flat(wo, layers.eta_top);
+    const float jacobian = wo.z / (layers.eta_top * layers.eta_top * inside_o.z);
+    return density.coat * detail::mirror_pdf(detail::above(wi), wo, layers.alpha_top) + density.bottom * detail::mirror_pdf(density.inside, inside_o, density.width) * jacobian +
+           density.diffuse * INV_PI<float> * wo.z;
+}
+
+}  // namespace nma::layered

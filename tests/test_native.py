@@ -1,0 +1,174 @@
+"""Plugins compiled for Mitsuba's scalar renderer against the vectorised ones, in processes of their own."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nma
+from nma import native
+from nma.errors import MissingDependencyError
+
+MATERIAL = {
+    "alpha_top": 0.08,
+    "alpha_bottom": 0.25,
+    "eta_top": 1.5,
+    "eta_conductor": {"type": "rgb", "value": [0.14, 0.37, 1.44]},
+    "k_conductor": {"type": "rgb", "value": [3.98, 2.38, 1.6]},
+    "albedo": {"type": "rgb", "value": [0.9, 0.3, 0.2]},
+    "sigma_t": 0.5,
+}
+TEXTURED = MATERIAL | {
+    "albedo": {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.2, 0.1]}, "color1": 0.3},
+    "alpha_bottom": {"type": "checkerboard", "color0": 0.1, "color1": 0.4},
+}
+# A ball under a bright sky and a lamp, seen so that all of the picture is the ball.
+PROGRAM = """
+    import json, sys
+    import mitsuba as mi
+    import numpy as np
+    import nma.render
+
+    variant, spp, *rest = json.loads(sys.argv[1])
+    nma.render.use(variant)
+    for seed, bsdf in enumerate(rest):
+        look = mi.ScalarTransform4f().look_at([0, -3, 0], [0, 0, 0], [0, 0, 1])
+        scene = mi.load_dict({
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 3},
+            "sensor": {"type": "perspective", "fov": 24, "to_world": look,
+                       "film": {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}},
+            "sky": {"type": "constant", "radiance": 0.3},
+            "lamp": {"type": "sphere", "center": [2, -3, 3], "radius": 1.0,
+                     "emitter": {"type": "area", "radiance": 10.0}},
+            "ball": {"type": "sphere", "bsdf": bsdf},
+        })
+        pictures = [np.array(mi.render(scene, spp=spp, seed=10 * seed + k)).mean(axis=(0, 1)) for k in range(6)]
+        print(json.dumps(np.array(pictures).tolist()))
+"""
+
+
+def tool():
+    if shutil.which("c++") is None:
+        pytest.skip("there is no C++ compiler here")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """Plugins are built once for all tests, not into the user's cache."""
+    tool()
+    before = os.environ.get("XDG_CACHE_HOME")
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+    yield native.build_mitsuba()
+    os.environ.pop("XDG_CACHE_HOME")
+    if before is not None:
+        os.environ["XDG_CACHE_HOME"] = before
+
+
+def run(*words):
+    command = [sys.executable, "-c", textwrap.dedent(PROGRAM), json.dumps(words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def pictures(variant, spp, *bsdfs):
+    """Mean colours (6, 3) of six renderings of each BSDF."""
+    done = run(variant, spp, *bsdfs)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return [np.array(json.loads(line)) for line in done.stdout.splitlines() if line.startswith("[[")]
+
+
+def agree(a, b):
+    """Means of two sets of six within 4.5 standard errors and 0.1 %: a false alarm in some ten thousand."""
+    error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 6)
+    return (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4.5 * error + 1e-3 * b.mean(axis=0)).all()
+
+
+def test_scalar_and_vectorised_plugins_render_the_same():
+    bsdfs = [{"type": kind, **material} for material in (MATERIAL, TEXTURED) for kind in ("nma", "layered")]
+    online = {"type": "nma", "online": True, **MATERIAL}
+    scalar = pictures("scalar_rgb", 32, *bsdfs, online)
+    vectorised = pictures("llvm_ad_rgb", 128, *bsdfs)
+    for mine, other in zip(scalar, vectorised, strict=False):
+        assert agree(mine, other), (mine.mean(axis=0), other.mean(axis=0))
+    assert agree(scalar[-1], vectorised[0])
+    # Materials differ by more than that: the comparison can fail.
+    assert not agree(scalar[0], vectorised[2])
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"sigma_t": 7.0}, "sigma_t is 7.0"),
+        ({"adapter": "none"}, "none: no such weights file"),
+        ({"albedo": None}, "no value for albedo"),
+    ],
+)
+def test_bad_inputs_are_refused_with_their_name(change, message):
+    bsdf = {k: v for k, v in {"type": "nma", **MATERIAL, **change}.items() if v is not None}
+    done = run("scalar_rgb", 1, bsdf)
+    assert done.returncode != 0
+    assert message in done.stderr
+
+
+def test_the_executable_renders_a_scene(cache, tmp_path):
+    executable = Path(sys.executable).parent / "mitsuba"
+    inputs = "".join(
+        f'<rgb name="{k}" value="{", ".join(map(str, v["value"]))}"/>'
+        if isinstance(v, dict)
+        else f'<float name="{k}" value="{v}"/>'
+        for k, v in MATERIAL.items()
+    )
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f"""<scene version="3.0.0">
+            <integrator type="path"/>
+            <sensor type="perspective">
+                <transform name="to_world"><lookat origin="0,-3,0" target="0,0,0" up="0,0,1"/></transform>
+                <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+                <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
+            </sensor>
+            <emitter type="constant"/>
+            <shape type="sphere"><bsdf type="nma">{inputs}</bsdf></shape>
+        </scene>"""
+    )
+    command = [executable, "-a", cache, "-m", "scalar_rgb", "-o", tmp_path / "out.exr", scene]
+    done = subprocess.run([str(w) for w in command], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "out.exr").stat().st_size > 1000
+
+
+def test_what_is_built_is_not_built_again(cache):
+    said = []
+    assert native.build_mitsuba(said.append) == cache
+    assert "up to date" in said[0]
+    assert {path.stem for path in (cache / "adapters").glob("*.safetensors")} == set(nma.shipped())
+
+
+def test_without_a_compiler_the_message_says_what_to_install(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    with pytest.raises(MissingDependencyError, match="sudo apt-get install g"):
+        native.compiler()
+
+
+def test_what_the_compiler_says_is_passed_on(tmp_path):
+    source = tmp_path / "broken.cpp"
+    source.write_text("int main() { return nothing; }\n")
+    with pytest.raises(native.BuildError, match="error: .nothing. was not declared|error: use of undeclared"):
+        native._compile([source, "-o", tmp_path / "broken"], [])
+
+
+def test_a_failed_build_leaves_nothing(tmp_path):
+    def make(folder):
+        (folder / "half").touch()
+        raise native.BuildError("no")
+
+    with pytest.raises(native.BuildError):
+        native._whole(tmp_path / "made", make)
+    assert not list(tmp_path.iterdir())
