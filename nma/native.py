@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import shutil
@@ -140,10 +139,12 @@ def _compile(words: Sequence[str | Path], flags: Sequence[str]) -> None:
 
 def _package(name: str) -> Path:
     """The folder of an installed package."""
-    found = importlib.util.find_spec(name)
-    if found is None or not found.submodule_search_locations:
-        raise MissingDependencyError(f"the package {name} is missing; install it with: pip install {name}")
-    return Path(next(iter(found.submodule_search_locations)))
+    try:
+        return Path(str(importlib.metadata.distribution(name).locate_file(name)))
+    except importlib.metadata.PackageNotFoundError:
+        raise MissingDependencyError(
+            f"the package {name} is missing; install it with: pip install {name}"
+        ) from None
 
 
 def _cache() -> Path:
