@@ -19,6 +19,7 @@ namespace {
 
 const nma::Material& of(const nma_material& material) { return *std::launder(reinterpret_cast<const nma::Material*>(&material)); }
 void put(nma_material* to, const nma::Material& material) { new (to) nma::Material(material); }
+nma::InstructionSet set_of(int number) { return static_cast<nma::InstructionSet>(number - NMA_PORTABLE); }
 nma::Direction direction(const float* v) { return {v[0], v[1], v[2]}; }
 
 // What `make` returns, or null with the reason in `message`.
@@ -31,9 +32,11 @@ nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
         }
         return nullptr;
     };
-    if (instruction_set < NMA_FASTEST || instruction_set > NMA_AVX512_BF16) return fail("no such instruction set");
     nma::Options options;
-    if (instruction_set != NMA_FASTEST) options.set = static_cast<nma::InstructionSet>(instruction_set);
+    options.compact = (instruction_set & NMA_COMPACT) != 0;
+    instruction_set &= ~NMA_COMPACT;
+    if (instruction_set < NMA_FASTEST || instruction_set > NMA_AVX512_BF16) return fail("no such instruction set");
+    if (instruction_set != NMA_FASTEST) options.set = set_of(instruction_set);
     try {
         return new nma_adapter{make(options)};
     } catch (const std::exception& e) {
@@ -43,7 +46,7 @@ nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
 
 }  // namespace
 
-int nma_supported(int set) { return set >= 0 && set <= NMA_AVX512_BF16 && nma::supported(static_cast<nma::InstructionSet>(set)); }
+int nma_supported(int set) { return set == NMA_FASTEST || (set >= NMA_PORTABLE && set <= NMA_AVX512_BF16 && nma::supported(set_of(set))); }
 
 nma_adapter* nma_load(const char* path, int set, char* message, size_t size) {
     return loaded([&](const nma::Options& options) { return nma::Adapter::load(path, options); }, set, message, size);
@@ -57,7 +60,7 @@ void nma_free(nma_adapter* adapter) { delete adapter; }
 
 int nma_parameter_count(const nma_adapter* a) { return a->adapter.parameter_count(); }
 int nma_output_count(const nma_adapter* a) { return a->adapter.output_count(); }
-int nma_instruction_set(const nma_adapter* a) { return static_cast<int>(a->adapter.instruction_set()); }
+int nma_instruction_set(const nma_adapter* a) { return static_cast<int>(a->adapter.instruction_set()) + NMA_PORTABLE; }
 
 void nma_prepare(const nma_adapter* a, const float* parameters, float cos_theta_i, nma_material* material) {
     put(material, a->adapter.prepare(parameters, cos_theta_i));

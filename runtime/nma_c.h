@@ -28,8 +28,9 @@ typedef struct {
     float opaque[96];
 } nma_material;
 
-/* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. */
-enum { NMA_FASTEST = -1, NMA_PORTABLE, NMA_NEON, NMA_AVX2, NMA_AVX512, NMA_AVX512_BF16 };
+/* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to one
+ * to have weights rounded to bfloat16: nma::Options. */
+enum { NMA_FASTEST, NMA_PORTABLE, NMA_NEON, NMA_AVX2, NMA_AVX512, NMA_AVX512_BF16, NMA_COMPACT = 0x100 };
 NMA_C_API int nma_supported(int instruction_set);
 
 NMA_C_API nma_adapter* nma_load(const char* path, int instruction_set, char* message, size_t message_size);

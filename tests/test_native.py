@@ -91,7 +91,7 @@ def agree(a, b):
 
 def test_scalar_and_vectorised_plugins_render_the_same():
     bsdfs = [{"type": kind, **material} for material in (MATERIAL, TEXTURED) for kind in ("nma", "layered")]
-    online = {"type": "nma", "online": True, **MATERIAL}
+    online = {"type": "nma", "online": True, "precision": "bfloat16", **MATERIAL}
     scalar = pictures("scalar_rgb", 32, *bsdfs, online)
     vectorised = pictures("llvm_ad_rgb", 128, *bsdfs)
     for mine, other in zip(scalar, vectorised, strict=False):
@@ -105,6 +105,7 @@ def test_scalar_and_vectorised_plugins_render_the_same():
     "change, message",
     [
         ({"sigma_t": 7.0}, "sigma_t is 7.0"),
+        ({"precision": "half"}, "precision is float32, compact or bfloat16, not 'half'"),
         ({"adapter": "none"}, "none: no such weights file"),
         ({"albedo": None}, "no value for albedo"),
     ],

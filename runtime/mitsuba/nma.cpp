@@ -2,8 +2,8 @@
 //
 // Properties, as of the Python BSDF of the same name: `adapter`, a shipped adapter's name or a weights file; `clamp`; and
 // the parameters of the adapter's class. Beside them, `online`: whether the network also runs at every shading point of a
-// material without textures, which otherwise becomes curves over cos(theta_i) when it is loaded; and `bfloat16`: whether it
-// may round to eight bits where the CPU then takes half the time.
+// material without textures, which otherwise becomes curves over cos(theta_i) when it is loaded; and `precision`: "float32",
+// "compact" (weights of eight bits, faster), or "bfloat16" (activations too, where the CPU has products of such).
 #include <mitsuba/core/fresolver.h>
 
 #include "inputs.h"
@@ -18,7 +18,7 @@ public:
     MI_IMPORT_TYPES()
 
     explicit NmaBSDF(const Properties& props)
-        : Base(props), name_(props.get<std::string_view>("adapter", "layered3-5x64")), adapter_(load(name_, props.get<bool>("bfloat16", false))),
+        : Base(props), name_(props.get<std::string_view>("adapter", "layered3-5x64")), adapter_(load(name_, props.get<std::string_view>("precision", "float32"))),
           inputs_(props, adapter_.parameters(), props.get<bool>("clamp", false)) {
         const bool online = props.get<bool>("online", false);
         m_flags = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
@@ -64,12 +64,15 @@ private:
     static constexpr int MOST_PARAMETERS = 64;
 
     // Weights lie beside the scene, as the files of Mitsuba's own plugins do; shipped ones beside the plugins.
-    static nma::Adapter load(const std::string& name, bool bfloat16) {
+    static nma::Adapter load(const std::string& name, std::string_view precision) {
         const auto resolver = file_resolver();
         auto path = resolver->resolve(name);
         if (!fs::exists(path)) path = resolver->resolve("adapters/" + name + ".safetensors");
+        if (precision != "float32" && precision != "compact" && precision != "bfloat16")
+            Throw("precision is float32, compact or bfloat16, not '%s'", precision);
         nma::Options options;
-        if (bfloat16 && nma::supported(nma::InstructionSet::avx512_bf16)) options.set = nma::InstructionSet::avx512_bf16;
+        options.compact = precision != "float32";
+        if (precision == "bfloat16" && nma::supported(nma::InstructionSet::avx512_bf16)) options.set = nma::InstructionSet::avx512_bf16;
         try {
             nma::Adapter adapter = nma::Adapter::load(fs::exists(path) ? path.string() : name, options);
             if (adapter.parameter_count() > MOST_PARAMETERS) throw nma::Error(name + ": a class of too many parameters");

@@ -41,11 +41,11 @@ class Network {
 public:
     Network() = default;
 
-    // Weights that are bfloat16 numbers take half the memory at no loss; avx512_bf16 rounds others to such.
-    Network(const std::vector<Layer>& layers, InstructionSet set) : kernels_(&kernels(set)) {
+    // With `compact`, or for avx512_bf16, weights are rounded to bfloat16, which takes half the memory.
+    Network(const std::vector<Layer>& layers, InstructionSet set, bool compact) : kernels_(&kernels(set)) {
         if (layers.size() > DEEPEST_NETWORK) throw Error("a network of more than " + std::to_string(DEEPEST_NETWORK) + " layers");
         view_.depth = static_cast<int>(layers.size());
-        const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || all_bfloat16(layers);
+        const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
         int in = detail::padded(layers.front().in, INPUT_STEP);
         for (std::size_t k = 0; k < layers.size(); ++k) {
             if (layers[k].in > WIDEST_LAYER || layers[k].out > WIDEST_LAYER) throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
@@ -72,13 +72,6 @@ public:
     }
 
 private:
-    static bool all_bfloat16(const std::vector<Layer>& layers) {
-        for (const Layer& layer : layers)
-            for (const float w : layer.matrix)
-                if (detail::bits(w) & 0xffff) return false;
-        return true;
-    }
-
     template <class T>
     T* room(std::vector<std::unique_ptr<T[], detail::FreeAligned>>& kept, std::size_t count) {
         kept.push_back(detail::aligned<T>(count));

@@ -30,7 +30,7 @@ int main(int count, char** words) {
         std::fprintf(stderr, "usage: %s WEIGHTS\n", words[0]);
         return 2;
     }
-    const nma::Adapter portable = nma::Adapter::load(words[1], {nma::InstructionSet::portable});
+    const nma::Adapter portable = nma::Adapter::load(words[1], {nma::InstructionSet::portable, false});
     std::mt19937 engine(1);
     std::uniform_real_distribution<float> uniform;
     std::vector<float> parameters, cosines;
@@ -43,7 +43,7 @@ int main(int count, char** words) {
     bool fine = true;
     for (const nma::InstructionSet set : nma::INSTRUCTION_SETS) {
         if (!nma::supported(set)) continue;
-        const nma::Adapter adapter = nma::Adapter::load(words[1], {set});
+        const nma::Adapter adapter = nma::Adapter::load(words[1], {set, false});
         for (const bool batch : {false, true}) {
             const std::vector<float> found = outputs(adapter, parameters, cosines, batch);
             double worst = 0.0, squares = 0.0;
