@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError
+from nma.llvm import ensure_llvm
 from nma.render.shaderball import shader_ball_file
 
 
@@ -208,8 +209,17 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
     import drjit as dr
     import mitsuba as mi
 
-    if "scalar" in (mi.variant() or "scalar"):
-        raise ParamError(f"preview_scene needs a vectorised variant such as llvm_ad_rgb, not {mi.variant()}")
+    variant = mi.variant()
+    if variant is None:
+        raise ParamError("sky_radiance needs a variant of Mitsuba; call nma.render.use() first")
+    if "scalar" in variant:
+        # The model is evaluated for all pixels at once.
+        ensure_llvm()
+        mi.set_variant("llvm_ad_rgb")
+        try:
+            return sky_radiance(sun_scale, height)
+        finally:
+            mi.set_variant(variant)
     model = {"type": "sunsky", "sun_direction": list(SUN_DIRECTION), "sun_aperture": SUN_APERTURE}
     model |= {"sun_scale": sun_scale, "sky_scale": SKY_SCALE, "turbidity": TURBIDITY}
     azimuth = (np.arange(2 * height) + 0.5) / height * np.pi

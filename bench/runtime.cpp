@@ -1,0 +1,212 @@
+// Times of the C++ runtime, one line of JSON for each measurement; bench/runtime.py compiles and runs it.
+//
+//     ./runtime NAME=WEIGHTS ...
+//
+// Every figure is the best of many repetitions over 240 random queries on one thread, in nanoseconds per query.
+#include "nma.h"
+
+#include <chrono>
+#include <cstdio>
+#include <random>
+
+#if __has_include(<Eigen/Dense>)
+#include <Eigen/Dense>
+#define HAS_EIGEN 1
+#endif
+
+namespace {
+
+constexpr int QUERIES = 240, REPETITIONS = 100;
+
+volatile float sink;
+
+double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
+
+// Nanoseconds per query of `all`, which answers every query once.
+template <class F>
+double best(F all, int repetitions = REPETITIONS) {
+    double least = 1e30;
+    for (int k = 0; k < repetitions; ++k) {
+        const double began = seconds();
+        all();
+        least = std::min(least, seconds() - began);
+    }
+    return least / QUERIES * 1e9;
+}
+
+void report(const std::string& network, const std::string& what, const char* set, double nanoseconds) {
+    std::printf("{\"network\": \"%s\", \"what\": \"%s\", \"set\": \"%s\", \"ns\": %.2f}\n", network.c_str(), what.c_str(), set, nanoseconds);
+}
+
+struct Queries {
+    std::vector<float> parameters, cosines, uniform;
+    std::vector<nma::Direction> wi, wo;
+
+    explicit Queries(const nma::Adapter& adapter) {
+        std::mt19937 engine(1);
+        std::uniform_real_distribution<float> u;
+        for (int q = 0; q < QUERIES; ++q) {
+            for (const nma::SourceParam& p : adapter.parameters())
+                for (int c = 0; c < p.size; ++c) {
+                    const float low = static_cast<float>(p.low), high = static_cast<float>(p.high);
+                    parameters.push_back(p.logarithmic ? low * std::pow(high / low, u(engine)) : low + (high - low) * u(engine));
+                }
+            cosines.push_back(0.02f + 0.98f * u(engine));
+            wi.push_back(direction(cosines.back(), u(engine)));
+            wo.push_back(direction(0.02f + 0.98f * u(engine), u(engine)));
+            for (int c = 0; c < 3; ++c) uniform.push_back(u(engine));
+        }
+    }
+
+    static nma::Direction direction(float z, float turn) {
+        const float r = std::sqrt(1.0f - z * z), phi = 6.2831853f * turn;
+        return {r * std::cos(phi), r * std::sin(phi), z};
+    }
+};
+
+void time_adapter(const std::string& network, const std::string& path, nma::Options options) {
+    const nma::Adapter adapter = nma::Adapter::load(path, options);
+    const Queries queries(adapter);
+    const std::string label = std::string(nma::name(adapter.instruction_set())) + (options.compact ? " compact" : "");
+    const char* set = label.c_str();
+    const int stride = adapter.parameter_count();
+    std::vector<nma::Material> materials(QUERIES);
+    std::vector<float> outputs(static_cast<std::size_t>(QUERIES) * adapter.output_count());
+    report(network, "inputs and network", set, best([&] {
+        alignas(64) float raw[nma::WIDEST_LAYER];
+        for (int q = 0; q < QUERIES; ++q) {
+            adapter.network_outputs(&queries.parameters[q * stride], queries.cosines[q], raw);
+            sink = raw[0];
+        }
+    }));
+    report(network, "prepare", set, best([&] {
+        for (int q = 0; q < QUERIES; ++q) {
+            const nma::Material made = adapter.prepare(&queries.parameters[q * stride], queries.cosines[q]);
+            sink = made.blend().weights[0];
+        }
+    }));
+    report(network, "inputs and network, batch", set, best([&] {
+        adapter.network_outputs_many(QUERIES, queries.parameters.data(), queries.cosines.data(), outputs.data());
+    }));
+    report(network, "prepare, batch", set, best([&] {
+        adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), materials.data());
+    }));
+    if (options.compact || options.set != nma::fastest()) return;
+    // What does not depend on the instruction set.
+    const nma::Curves curves(adapter, queries.parameters.data());
+    report(network, "curves", "any", best([&] {
+        for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weights[0];
+    }));
+    report(network, "eval and pdf", "any", best([&] {
+        for (int q = 0; q < QUERIES; ++q) sink = materials[q].eval(queries.wi[q], queries.wo[q]).value.x;
+    }));
+    report(network, "sample, eval and pdf", "any", best([&] {
+        for (int q = 0; q < QUERIES; ++q) {
+            const float* u = &queries.uniform[3 * q];
+            sink = materials[q].sample(queries.wi[q], u[0], u[1], u[2]).value.x;
+        }
+    }));
+}
+
+// A network alone, of zeros, on one query after the other and on all together.
+void time_network(const std::string& name, const std::vector<int>& sizes, nma::InstructionSet set, bool compact, int repetitions = REPETITIONS) {
+    std::vector<nma::Layer> layers;
+    double products = 0.0;
+    for (std::size_t k = 0; k + 1 < sizes.size(); ++k) {
+        nma::Layer layer;
+        layer.in = sizes[k];
+        layer.out = sizes[k + 1];
+        layer.matrix.assign(static_cast<std::size_t>(layer.in) * layer.out, 0.01f);
+        layer.bias.assign(layer.out, 0.0f);
+        products += static_cast<double>(layer.in) * layer.out;
+        layers.push_back(layer);
+    }
+    const nma::Network network(layers, set, compact);
+    const auto inputs = nma::detail::aligned<float>(static_cast<std::size_t>(QUERIES) * network.input_stride());
+    const auto outputs = nma::detail::aligned<float>(static_cast<std::size_t>(QUERIES) * network.output_stride());
+    const std::string label = std::string(nma::name(set)) + (compact ? " compact" : "");
+    report(name, "network", label.c_str(), best([&] {
+        for (int q = 0; q < QUERIES; ++q) network.forward(inputs.get() + q * network.input_stride(), outputs.get());
+    }, repetitions));
+    const double many = best([&] { network.forward_many(QUERIES, inputs.get(), outputs.get()); }, repetitions);
+    report(name, "network, batch", label.c_str(), many);
+    std::printf("{\"network\": \"%s\", \"what\": \"multiply-adds per ns, batch\", \"set\": \"%s\", \"ns\": %.2f}\n", name.c_str(), label.c_str(), products / many);
+}
+
+#ifdef HAS_EIGEN
+void time_eigen(const std::string& name, const std::vector<int>& sizes) {
+    std::vector<Eigen::MatrixXf> matrices;
+    std::vector<Eigen::VectorXf> biases;
+    for (std::size_t k = 0; k + 1 < sizes.size(); ++k) {
+        matrices.push_back(Eigen::MatrixXf::Constant(sizes[k + 1], sizes[k], 0.01f));
+        biases.push_back(Eigen::VectorXf::Zero(sizes[k + 1]));
+    }
+    const auto forward = [&](auto x) {
+        for (std::size_t k = 0; k < matrices.size(); ++k) {
+            x = ((matrices[k] * x).colwise() + biases[k]).eval();
+            if (k + 1 < matrices.size()) x = x.cwiseMax(0.0f).eval();
+        }
+        sink = x(0, 0);
+    };
+    const Eigen::VectorXf one = Eigen::VectorXf::Ones(sizes[0]);
+    const Eigen::MatrixXf many = Eigen::MatrixXf::Ones(sizes[0], QUERIES);
+    report(name, "network", "Eigen", best([&] {
+        for (int q = 0; q < QUERIES; ++q) {
+            Eigen::VectorXf x = one;
+            for (std::size_t k = 0; k < matrices.size(); ++k) {
+                x = (matrices[k] * x + biases[k]).eval();
+                if (k + 1 < matrices.size()) x = x.cwiseMax(0.0f).eval();
+            }
+            sink = x(0);
+        }
+    }));
+    report(name, "network, batch", "Eigen", best([&] { forward(many); }));
+}
+#endif
+
+// Multiply-adds per nanosecond of independent chains: the most that this core can do.
+NMA_TARGET("avx512f,fma") double peak_avx512() {
+#ifdef NMA_X86
+    __m512 sums[12];
+    for (auto& sum : sums) sum = _mm512_set1_ps(0.5f);
+    const __m512 factor = _mm512_set1_ps(0.999f), step = _mm512_set1_ps(0.001f);
+    double most = 0.0;
+    for (int k = 0; k < 20; ++k) {
+        constexpr long STEPS = 200000;
+        const double began = seconds();
+        for (long n = 0; n < STEPS; ++n) NMA_UNROLL for (int i = 0; i < 12; ++i) sums[i] = _mm512_fmadd_ps(sums[i], factor, step);
+        most = std::max(most, STEPS * 12.0 * 16.0 / (seconds() - began) / 1e9);
+    }
+    for (auto& sum : sums) sink = _mm512_cvtss_f32(sum);
+    return most;
+#else
+    return 0.0;
+#endif
+}
+
+}  // namespace
+
+int main(int count, char** words) {
+    using nma::InstructionSet;
+    if (nma::supported(InstructionSet::avx512)) report("", "peak multiply-adds per ns", "avx512", peak_avx512());
+    const std::pair<const char*, std::vector<int>> networks[] = {{"5x64", {16, 64, 64, 64, 64, 64, 23}}, {"3x32", {16, 32, 32, 32, 23}}};
+    // A decoder of the size of Fan et al. 2022: 1.07 M numbers.
+    const std::vector<int> large{38, 512, 512, 512, 512, 512, 3};
+    for (const InstructionSet set : nma::INSTRUCTION_SETS) {
+        if (!nma::supported(set)) continue;
+        const bool rounds = set == InstructionSet::avx512_bf16;
+        for (const bool compact : {false, true}) {
+            if (rounds && !compact) continue;
+            for (const auto& [name, sizes] : networks) time_network(name, sizes, set, compact);
+            for (int k = 1; k < count; ++k) {
+                const std::string word = words[k];
+                const std::size_t split = word.find('=');
+                time_adapter(word.substr(0, split), word.substr(split + 1), {set, compact});
+            }
+        }
+        time_network("1.07 M", large, set, rounds, 10);
+    }
+#ifdef HAS_EIGEN
+    for (const auto& [name, sizes] : networks) time_eigen(name, sizes);
+#endif
+}
