@@ -12,6 +12,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from target_cases import random_blend, random_directions, stacked
 
 import nma
@@ -266,6 +267,52 @@ def test_samples_have_the_values_and_densities_of_eval(library):
         assert np.abs(np.linalg.norm(drawn[:, :3], axis=1) - 1)[valid].max() < 1e-5
         again = loaded.eval(materials, wi, np.ascontiguousarray(drawn[:, :3]))
     np.testing.assert_allclose(drawn[valid, 3:], again[valid], rtol=1e-6)
+
+
+def test_samples_follow_the_density(library):
+    """Chi-square tests of 12 materials in 24 x 48 bins of cos(theta) and azimuth, directions below the horizon in one
+    of their own; a correct sampler fails one of them with a chance of 1e-3. For lobes of any width, and in double
+    precision, tests/test_target_sampling.py tests the functions that this runtime repeats."""
+    tests, samples, parts = 12, 200_000, 16
+    params, cosines = queries(12)
+    params, cosines = params[:tests], cosines[:tests]
+    params[:, :2] = np.random.default_rng(13).uniform(0.1, 0.3, (tests, 2))
+    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1).astype(np.float32)
+    z, phi = ((np.arange(n * parts) + 0.5) / (n * parts) for n in (24, 48))
+    z, phi = (x.ravel() for x in np.meshgrid(z, 2 * np.pi * phi, indexing="ij"))
+    r = np.sqrt(1 - z * z)
+    grid = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).astype(np.float32)
+    rng = np.random.default_rng(14)
+    with Loaded(library, stored("layered3-5x64")) as loaded:
+        materials = loaded.prepare(params, cosines)
+        for k in range(tests):
+            drawn = loaded.sample(
+                *(np.repeat(x[k : k + 1], samples, 0) for x in (materials, wi)),
+                rng.random((samples, 3), np.float32),
+            )
+            valid = drawn[:, 6] > 0
+            azimuth = np.arctan2(drawn[:, 1], drawn[:, 0]) % (2 * np.pi)
+            counts, *_ = np.histogram2d(drawn[valid, 2], azimuth[valid], (24, 48), ((0, 1), (0, 2 * np.pi)))
+            density = loaded.eval(*(np.repeat(x[k : k + 1], len(grid), 0) for x in (materials, wi)), grid)[
+                :, 3
+            ]
+            expected = density.astype(np.float64).reshape(24, parts, 48, parts).sum(axis=(1, 3))
+            expected *= samples * 2 * np.pi / len(grid)
+            found = np.append(counts.ravel(), (~valid).sum())
+            wanted = np.append(expected.ravel(), samples - expected.sum())
+            assert chi_square(found, wanted) > 1 - (1 - 1e-3) ** (1 / tests), k
+            # With a density that is a tenth off at both ends it is not content.
+            assert chi_square(found, wanted * np.linspace(0.9, 1.1, wanted.size)) < 1e-6
+
+
+def chi_square(found, wanted):
+    """The p-value; bins that expect fewer than ten are taken together."""
+    few = wanted < 10
+    found = np.append(found[~few], found[few].sum())
+    wanted = np.append(wanted[~few], max(wanted[few].sum(), 1e-3))
+    keep = wanted > 5
+    statistic = ((found[keep] - wanted[keep]) ** 2 / wanted[keep]).sum()
+    return chi2.sf(statistic, keep.sum() - 1)
 
 
 def test_an_instruction_set_that_this_cpu_lacks_falls_back(library):
