@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from machine import header
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import nma
 import nma.render
@@ -46,7 +45,8 @@ def main() -> None:
     with progress("materials/min") as bar:
         task = bar.add_task("rendering", total=len(params), rate="", note="")
         for number, values in enumerate(params):
-            rows.append(compare(material(values), arguments, number < arguments.error))
+            subject = Material.of_vector(f"unseen-{number}", values, nma.LAYERED3)
+            rows.append(compare(subject, arguments, number < arguments.error))
             speed = bar.tasks[task].speed
             bar.update(task, advance=1, rate=f"{60 * speed:.1f}" if speed else "")
     result = summary(rows)
@@ -70,16 +70,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--reference-spp", type=int, default=2048, help="samples of the converged pictures")
     parser.add_argument("--output", type=Path, default=Path("out/bench"))
     return parser.parse_args()
-
-
-def material(values: NDArray[np.float64]) -> Material:
-    named = {
-        name: float(values[columns][0])
-        if columns.stop - columns.start == 1
-        else tuple(values[columns].tolist())
-        for name, columns in nma.LAYERED3.slices.items()
-    }
-    return Material("unseen", "unseen", "", nma.LAYERED3.name, named)
 
 
 def bsdfs(subject: Material) -> dict[str, dict[str, Any]]:

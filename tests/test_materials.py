@@ -11,6 +11,7 @@ import pytest
 from nma import materials
 from nma.data import load_conductors
 from nma.errors import MaterialError, TextureError
+from nma.params import LAYERED3
 
 ROOT = Path(__file__).parents[1]
 PLAIN = """
@@ -198,3 +199,11 @@ def test_the_corpus_is_what_its_script_makes(tmp_path):
     )
     shipped = ROOT / "nma" / "data" / "conductors.csv"
     assert out.read_text() == shipped.read_text()
+
+
+def test_a_vector_becomes_a_material_and_back():
+    vector = LAYERED3.sample(np.random.default_rng(1), 1)[0]
+    material = materials.Material.of_vector("drawn-1", vector, LAYERED3)
+    np.testing.assert_allclose(material.vector(), vector)
+    assert material.title == "Drawn 1"
+    assert isinstance(material.values["albedo"], tuple)

@@ -104,6 +104,17 @@ class Material:
         numbers: dict[str, Any] = dict(self.values)
         return self.space.vector(numbers)
 
+    @staticmethod
+    def of_vector(name: str, vector: NDArray[np.float64], space: ParamSpace) -> Material:
+        """The material of a parameter vector, one row of those that `ParamSpace.sample` draws."""
+        values: dict[str, Any] = {
+            param.name: float(vector[columns][0])
+            if param.size == 1
+            else tuple(np.asarray(vector)[columns].tolist())
+            for param, columns in zip(space.params, space.slices.values(), strict=True)
+        }
+        return Material(name, name.replace("-", " ").capitalize(), "", space.name, values)
+
     def changed(self, given: Mapping[str, Any], where: str | Path = "changes") -> Material:
         """A copy with some parameters replaced, given as in a file: numbers, lists, `conductor`, textures.
 

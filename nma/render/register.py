@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 from nma import native
 
@@ -45,8 +46,9 @@ def _on_variant(old: str | None, new: str) -> None:
 
 def _add_resource(folder: str) -> None:
     """Puts a folder on Mitsuba's resource path, once."""
-    import mitsuba as mi
+    import mitsuba
 
+    mi: Any = mitsuba  # its types do not know this function
     resources = mi.file_resolver()
     if folder not in [str(path) for path in resources]:
         resources.append(folder)
