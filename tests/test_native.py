@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import nma
-from nma import native
+from nma import encoding, native, network
 from nma.errors import MissingDependencyError
 
 MATERIAL = {
@@ -173,3 +173,34 @@ def test_a_failed_build_leaves_nothing(tmp_path):
     with pytest.raises(native.BuildError):
         native._whole(tmp_path / "made", make)
     assert not list(tmp_path.iterdir())
+
+
+def test_python_reaches_the_batched_kernel(tmp_path):
+    from nma.runtime import Runtime, available
+
+    rng = np.random.default_rng(0)
+    params, cosines = nma.LAYERED3.sample(rng, 500), rng.uniform(0.05, 1, 500)
+    adapter = nma.Adapter.load("layered3-3x32")
+    inputs = encoding.get(adapter.encoding)(list(params.T), cosines)
+    wanted = network.forward(adapter.layers, np.stack(inputs, axis=-1))
+    for name in available():
+        runtime = Runtime("layered3-3x32", name)
+        assert runtime.instruction_set == name
+        error = np.abs(runtime.outputs(params, cosines) - wanted)
+        assert np.median(error) < (0.05 if name == "avx512_bf16" else 1e-5)
+    runtime = Runtime("layered3-3x32")
+    materials = runtime.prepare(params, cosines)
+    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
+    wo, value, pdf = runtime.sample(materials, wi, rng.random((500, 3)))
+    again, density = runtime.eval(materials, wi, wo)
+    np.testing.assert_allclose(again[pdf > 0], value[pdf > 0], rtol=1e-6)
+    np.testing.assert_allclose(density[pdf > 0], pdf[pdf > 0], rtol=1e-6)
+
+    with pytest.raises(nma.errors.WeightsError, match="no such weights file"):
+        Runtime(tmp_path / "none.safetensors")
+    with pytest.raises(nma.errors.ParamError, match="no instruction set 'mmx'"):
+        Runtime("layered3-3x32", "mmx")
+    with pytest.raises(nma.errors.ParamError, match=r"params wants shape \(n, 13\), got \(13,\)"):
+        runtime.prepare(params[0], cosines[:1])
+    with pytest.raises(nma.errors.ParamError, match="500 rows of params for 499 cosines"):
+        runtime.prepare(params, cosines[1:])

@@ -1,0 +1,132 @@
+"""The C++ runtime from Python, for many queries at once: a compiled library, made when it is first wanted.
+
+    runtime = nma.runtime.Runtime("layered3-5x64")
+    materials = runtime.prepare(params, cos_theta_i)           # (n, 13), (n,)
+    value, pdf = runtime.eval(materials, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
+    wo, value, pdf = runtime.sample(materials, wi, u)
+
+Directions are unit vectors (n, 3) in the local frame, z up, `wi` towards the viewer, of the cosine that the material
+was prepared for. All arrays become float32.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nma import native
+from nma.adapter import shipped
+from nma.errors import ParamError, WeightsError
+
+Array = NDArray[np.float32]
+# As nma_c.h numbers them.
+INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
+_COMPACT = 0x100
+# Floats of an opaque material.
+_MATERIAL = 96
+_MESSAGE = 500
+
+
+def available() -> tuple[str, ...]:
+    """The instruction sets of this CPU."""
+    return tuple(name for k, name in enumerate(INSTRUCTION_SETS[1:], 1) if _library().nma_supported(k))
+
+
+class Runtime:
+    """A loaded adapter.
+
+    Args:
+        adapter: a shipped adapter's name, or a weights file.
+        instruction_set: one of `INSTRUCTION_SETS`; one that the CPU lacks becomes "portable". All but "avx512_bf16"
+            compute in float32.
+        compact: round weights to bfloat16, which is faster; `runtime/README.md` says what it costs.
+
+    Raises:
+        WeightsError: a file that is missing or damaged.
+        ParamError: an unknown instruction set.
+        MissingDependencyError, BuildError: the library cannot be compiled here.
+    """
+
+    def __init__(self, adapter: str | Path, instruction_set: str = "fastest", *, compact: bool = False):
+        if instruction_set not in INSTRUCTION_SETS:
+            raise ParamError(
+                f"no instruction set {instruction_set!r}; there are {', '.join(INSTRUCTION_SETS)}"
+            )
+        self._library = _library()
+        path = Path(adapter)
+        if str(adapter) in shipped():
+            path = Path(__file__).parent / "adapters" / f"{adapter}.safetensors"
+        number = INSTRUCTION_SETS.index(instruction_set) + (_COMPACT if compact else 0)
+        message = ctypes.create_string_buffer(_MESSAGE)
+        handle = self._library.nma_load(str(path).encode(), number, message, _MESSAGE)
+        if not handle:
+            raise WeightsError(message.value.decode())
+        self._handle = ctypes.c_void_p(handle)
+        self.parameters = self._library.nma_parameter_count(self._handle)
+        self.size = self._library.nma_output_count(self._handle)
+        self.instruction_set = INSTRUCTION_SETS[self._library.nma_instruction_set(self._handle)]
+
+    def __del__(self) -> None:
+        if handle := getattr(self, "_handle", None):
+            self._library.nma_free(handle)
+
+    def outputs(self, params: ArrayLike, cos_theta_i: ArrayLike) -> Array:
+        """What the network returns, before decoding: (n, size)."""
+        return self._many("nma_outputs_many", params, cos_theta_i, self.size)
+
+    def prepare(self, params: ArrayLike, cos_theta_i: ArrayLike) -> Array:
+        """Materials for `eval` and `sample`, opaque rows, for parameters (n, parameters) and cosines (n,) in 0..1."""
+        return self._many("nma_prepare_many", params, cos_theta_i, _MATERIAL)
+
+    def eval(self, materials: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
+        """f cos(theta_o) [1/sr] (n, 3) and the density of `sample` [1/sr] (n,), both 0 below the horizon."""
+        found = self._each("nma_eval", materials, wi, wo, 4)
+        return found[:, :3], found[:, 3]
+
+    def sample(self, materials: Array, wi: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
+        """Directions (n, 3) drawn with uniform numbers (n, 3) in [0, 1), and `eval` of them; a density of 0 marks an
+        invalid one."""
+        found = self._each("nma_sample", materials, wi, u, 7)
+        return found[:, :3], found[:, 3:6], found[:, 6]
+
+    def _many(self, name: str, params: ArrayLike, cos_theta_i: ArrayLike, width: int) -> Array:
+        rows, cosines = _rows("params", params, self.parameters), _rows("cos_theta_i", cos_theta_i, 0)
+        if len(rows) != len(cosines):
+            raise ParamError(f"{len(rows)} rows of params for {len(cosines)} cosines")
+        found = np.empty((len(rows), width), np.float32)
+        call = getattr(self._library, name)
+        call(self._handle, len(rows), *(_pointer(a) for a in (rows, cosines, found)))
+        return found
+
+    def _each(self, name: str, materials: Array, first: ArrayLike, second: ArrayLike, width: int) -> Array:
+        arrays = _rows("materials", materials, _MATERIAL), _rows("wi", first, 3), _rows("wo or u", second, 3)
+        if len({len(array) for array in arrays}) > 1:
+            raise ParamError(f"arrays of different lengths: {', '.join(str(len(a)) for a in arrays)}")
+        found = np.empty((len(arrays[0]), width), np.float32)
+        getattr(self._library, name)(len(found), *(_pointer(a) for a in (*arrays, found)))
+        return found
+
+
+def _rows(name: str, values: ArrayLike, width: int) -> Array:
+    """Contiguous float32, (n, width), or (n,) for width 0."""
+    array = np.ascontiguousarray(values, np.float32)
+    if array.shape[1:] != ((width,) if width else ()) or array.ndim != (2 if width else 1):
+        raise ParamError(f"{name} wants shape {f'(n, {width})' if width else '(n,)'}, got {array.shape}")
+    return array
+
+
+def _pointer(array: Array) -> Any:
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    loaded = ctypes.CDLL(str(native.library()))
+    loaded.nma_load.restype = ctypes.c_void_p
+    loaded.nma_load.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t]
+    return loaded
