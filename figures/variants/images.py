@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,16 +15,14 @@ import nma
 from nma.contact_sheet import Row, contact_sheet
 from nma.image_metrics import METRICS
 from nma.materials import Material
-from nma.render.load import load_dict, material_bsdf
-from nma.render.progressive import render_passes
-from nma.render.scene import LAMP_RADIANCE
+from nma.render.load import material_bsdf
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import studio
 
 Images = NDArray[np.float32]
 # Seeds of the renderings: the references' own, and that of the second one, which shows what noise alone scores.
 REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
-
-# The soft box's side in those of the scene's lamp.
-SOFT_BOX = 7
 
 
 class View(NamedTuple):
@@ -41,7 +40,7 @@ class Gallery:
     def __init__(self, store: Store, view: View, validation: str):
         self._store, self._view, self._validation = store, view, validation
         rows = store.validation.params[: view.materials]
-        self.materials = [material(number, row) for number, row in enumerate(rows)]
+        self.materials = [studio.material(number, row) for number, row in enumerate(rows)]
         self.reference = self._simulated(view.reference_spp, REFERENCE_SEED)
 
     def noise(self) -> dict[str, float]:
@@ -87,7 +86,7 @@ class Gallery:
         path = self._store.folder / "pictures" / words
         if path.exists() and (newer_than is None or path.stat().st_mtime > newer_than.stat().st_mtime):
             return np.load(path)
-        pictures = np.stack([render(bsdf(m), view.size, spp, seed) for m in self.materials])
+        pictures = np.stack([studio.render(bsdf(m), view.size, spp, seed) for m in self.materials])
         path.parent.mkdir(exist_ok=True)
         # A whole file or none, whenever the run is killed.
         temporary = path.with_suffix(".partial.npy")
@@ -95,31 +94,6 @@ class Gallery:
         temporary.replace(path)
         print(f"{path.name}", flush=True)
         return pictures
-
-
-def material(number: int, params: NDArray[np.float64]) -> Material:
-    """A row of parameters as a material."""
-    values = {
-        name: float(params[columns][0])
-        if columns.stop - columns.start == 1
-        else tuple(params[columns].tolist())
-        for name, columns in nma.LAYERED3.slices.items()
-    }
-    return Material(f"validation-{number}", f"Validation material {number}", "", nma.LAYERED3.name, values)
-
-
-def render(bsdf: dict[str, Any], size: int, spp: int, seed: int) -> Images:
-    return render_passes(load_dict(studio(bsdf, size)), spp, seed=seed)
-
-
-def studio(bsdf: dict[str, Any], size: int) -> dict[str, Any]:
-    """The preview scene under a sky without a sun and a soft box in place of the lamp, with one bounce of light: the
-    noise of small lights and caustics would hide what tells the variants apart."""
-    scene = nma.preview_scene(bsdf, size=(size, size), hide_sun=True, max_depth=3)
-    scene["lamp"]["to_world"] = scene["lamp"]["to_world"].scale(SOFT_BOX)
-    radiance = [value / SOFT_BOX**2 for value in LAMP_RADIANCE]
-    scene["lamp"]["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
-    return scene
 
 
 def compare(pictures: Images, references: Images) -> dict[str, float]:
@@ -138,7 +112,7 @@ def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int =
     chosen = worst_first[np.unique(np.linspace(0, len(worst_first) // 2, rows).astype(int))]
     lines = [
         Row(
-            describe(gallery.materials[m]),
+            studio.describe(gallery.materials[m]),
             [gallery.reference[m], *(images[m] for images in pictures.values())],
             ["", *(f"FLIP {flip[m]:.4f}" for flip in flips.values())],
         )
@@ -149,9 +123,3 @@ def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int =
         f"LDR-FLIP; rows by that of {next(iter(flips))}, worst first",
     )
     contact_sheet(path, lines, ["reference", *pictures], title=title, note=note)
-
-
-def describe(material: Material) -> str:
-    """A material's widths, optical depth and index in a line."""
-    short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
-    return short.format(material.title, **material.values)

@@ -1,0 +1,292 @@
+"""Rendered error of the shipped adapters and of a single instance over samples per pixel (paper Table 2, last rows).
+
+    python figures/rendered/run.py [--quick] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
+        [--single WEIGHTS] [--only SUBJECT ...]
+
+Pictures of few samples differ from their reference by noise, whatever renders them. So every adapter, and the
+simulation once more, are compared with a converged simulation at ever more samples: the simulation's own curve tells
+how much of an adapter's is noise. Takes about two hours of one core; what is rendered is kept in
+out/figures/rendered, so a killed run goes on, and processes with different --only share the work.
+Prints the tables of README.md and writes rendered.json, rendered.png and materials.png beside this file; with --quick,
+of few small pictures, to out/figures/rendered.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+import nma
+import nma.render
+from nma.cli.console import progress
+from nma.contact_sheet import Row, contact_sheet
+from nma.image_metrics import METRICS
+from nma.render.load import material_bsdf
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+import studio
+
+SIMULATION, AGAIN, SINGLE = "reference", "simulation again", "single"
+# Of the paper's Table 2: blended + omega_i against single.
+PAPER = {"flip_hdr": (0.0432, 0.89), "flip_ldr": (0.0352, 0.91)}
+# The single variant that figures/variants trains first.
+SINGLE_WEIGHTS = common.ROOT / "out/figures/variants/single_8000_6000-steps_seed-0.safetensors"
+# Correlated multi-jittered samples (Kensler 2013): at 64 samples a sixth of the adapters' variance of independent ones,
+# and two thirds of the simulation's.
+SAMPLER = "multijitter"
+FIRST_LEVEL = 64
+# Enough to see how the simulation's own noise falls.
+AGAIN_SPP = 256
+ROWS = 4
+
+
+class Subject(NamedTuple):
+    """What renders the materials: an adapter's weights, or the simulation, with a seed of its own."""
+
+    name: str
+    weights: Path | str | None
+    spp: int
+    seed: int
+
+    def bsdf(self, material: nma.materials.Material) -> dict[str, Any]:
+        if self.weights is None:
+            return material_bsdf(material, "layered")
+        return material_bsdf(material, "nma", adapter=self.weights)
+
+    @property
+    def key(self) -> str:
+        """Names its pictures: other weights have other ones."""
+        if self.weights is None:
+            return f"layered_seed-{self.seed}"
+        layers = nma.Adapter.load(self.weights).layers
+        weights = b"".join(np.asarray(part, np.float32).tobytes() for layer in layers for part in layer)
+        return f"{self.name}_{hashlib.sha256(weights).hexdigest()[:12]}"
+
+
+def main() -> None:
+    arguments = parse()
+    folder = common.results(__file__, arguments.quick)
+    kept = common.ROOT / "out/figures/rendered" / ("quick" if arguments.quick else "pictures")
+    kept.mkdir(parents=True, exist_ok=True)
+    count, population, seed = common.SETS["range"]
+    params = nma.LAYERED3.sample(np.random.default_rng(seed), count, population)[: arguments.materials]
+    materials = [studio.material(number, row) for number, row in enumerate(params)]
+    nma.render.use()
+    pictures = {}
+    for subject in subjects(arguments):
+        if not arguments.only or subject.name in arguments.only:
+            pictures[subject.name] = gallery(subject, materials, arguments.resolution, kept)
+    if not arguments.only:
+        report(pictures, materials, arguments, folder)
+
+
+def parse() -> argparse.Namespace:
+    parser = common.parser(__doc__)
+    parser.add_argument("--materials", type=int, default=89, help="of the set of 89, in its order")
+    parser.add_argument("--resolution", type=int, default=96, help="of the pictures, in pixels")
+    parser.add_argument("--spp", type=int, default=1024, help="most samples per pixel of the adapters")
+    parser.add_argument("--reference-spp", type=int, default=4096, help="samples per pixel of the simulation")
+    parser.add_argument("--single", type=Path, default=SINGLE_WEIGHTS, help="weights of a single instance")
+    parser.add_argument("--only", nargs="+", help="render these alone, and report nothing")
+    arguments = parser.parse_args()
+    if arguments.quick:
+        vars(arguments).update(materials=2, resolution=64, spp=128, reference_spp=128)
+    return arguments
+
+
+def subjects(arguments: argparse.Namespace) -> list[Subject]:
+    spp = arguments.spp
+    found = [
+        Subject(SIMULATION, None, arguments.reference_spp, 1),
+        Subject(AGAIN, None, min(spp, AGAIN_SPP), 2),
+    ]
+    found += [Subject(name, name, spp, 3) for name in nma.shipped()]
+    if arguments.single.exists():
+        found.append(Subject(SINGLE, arguments.single, spp, 3))
+    elif not arguments.quick:
+        sys.exit(
+            f"{arguments.single}: no such file; figures/variants/run.py --only single --seeds 1 makes it"
+        )
+    return found
+
+
+def levels(spp: int) -> list[int]:
+    """Samples per pixel at which pictures are kept: doubled up to `spp`."""
+    found = [min(FIRST_LEVEL, spp)]
+    while found[-1] < spp:
+        found.append(min(2 * found[-1], spp))
+    return found
+
+
+def gallery(
+    subject: Subject, materials: list[nma.materials.Material], size: int, kept: Path
+) -> list[NDArray[np.float32]]:
+    """The pictures (levels, size, size, 3) of each material, rendered where they are not there yet."""
+    found, bar = [], progress("materials/min")
+    with bar:
+        task = bar.add_task(subject.name, total=len(materials), rate="", note=f"{subject.spp} spp")
+        for number, material in enumerate(materials):
+            path = kept / f"{subject.key}_{size}px_{subject.spp}-spp_{number}.npy"
+            if not path.exists():
+                # A whole file or none, whenever the run is killed.
+                partial_file = path.with_suffix(".partial.npy")
+                np.save(partial_file, converge(subject, subject.bsdf(material), size, earlier(path, subject)))
+                partial_file.replace(path)
+            found.append(np.load(path))
+            rate = bar.tasks[task].speed
+            bar.update(task, advance=1, rate=f"{60 * rate:.1f}" if rate else "")
+    return found
+
+
+def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
+    """The levels that a run of fewer samples has rendered."""
+    for spp in reversed(levels(subject.spp)[:-1]):
+        shorter = path.with_name(path.name.replace(f"_{subject.spp}-spp_", f"_{spp}-spp_"))
+        if shorter.exists():
+            return list(np.load(shorter))
+    return []
+
+
+def converge(
+    subject: Subject, bsdf: dict[str, Any], size: int, found: list[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Pictures (levels, size, size, 3) of ever more samples, each made of those of the one before and new ones; the
+    first levels may have been `found` already."""
+    steps = levels(subject.spp)
+    before = steps[len(found) - 1] if found else 0
+    total = before * found[-1].astype(np.float64) if found else np.zeros((size, size, 3))
+    for number, level in list(enumerate(steps))[len(found) :]:
+        more = studio.render(bsdf, size, level - before, seed=1000 * subject.seed + number, sampler=SAMPLER)
+        total += (level - before) * more.astype(np.float64)
+        before = level
+        found.append((total / level).astype(np.float32))
+    return np.asarray(found)
+
+
+def report(
+    pictures: dict[str, list[NDArray[np.float32]]],
+    materials: list[nma.materials.Material],
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    """Prints and writes figures, tables, plot and pictures."""
+    references = [levels_of_it[-1] for levels_of_it in pictures[SIMULATION]]
+    steps = levels(arguments.spp)
+    errors = {
+        name: {
+            spp: compare([own[n] for own in images], references)
+            for n, spp in enumerate(steps)
+            if n < len(images[0])
+        }
+        for name, images in pictures.items()
+        if name != SIMULATION
+    }
+    means = {
+        name: {spp: {metric: mean(row, metric) for metric in METRICS} for spp, row in by_spp.items()}
+        for name, by_spp in errors.items()
+    }
+    text = markdown(means, arguments)
+    print(text)
+    (folder / "tables.md").write_text(text)
+    settings = {key: getattr(arguments, key) for key in ("materials", "resolution", "spp", "reference_spp")}
+    flips = {
+        name: {metric: [round(row[metric], 5) for row in by_spp[max(by_spp)]] for metric in PAPER}
+        for name, by_spp in errors.items()
+    }
+    data = {"settings": settings, "means": means, "flip_by_material": flips}
+    common.write_json(folder / "rendered.json", data)
+    plot(means, folder / "rendered.png")
+    sheet(pictures, flips, materials, folder / "materials.png")
+
+
+def compare(
+    images: list[NDArray[np.float32]], references: list[NDArray[np.float32]]
+) -> list[dict[str, float]]:
+    return [nma.compare_images(image, own) for image, own in zip(images, references, strict=True)]
+
+
+def mean(rows: list[dict[str, float]], metric: str) -> float:
+    return round(float(np.mean([row[metric] for row in rows])), 7)
+
+
+def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.Namespace) -> str:
+    """All metrics at the most samples, then FLIP over samples."""
+    most = arguments.spp
+    lines = [
+        f"{arguments.materials} materials, {arguments.resolution} x {arguments.resolution} pixels; reference:"
+        f" {arguments.reference_spp} samples per pixel.",
+        "",
+        "| | samples | " + " | ".join(METRICS) + " |",
+        "|---|---|" + "---|" * len(METRICS),
+    ]
+    lines += [
+        f"| {name} | {max(by_spp)} | "
+        + " | ".join(f"{by_spp[max(by_spp)][metric]:.5f}" for metric in METRICS)
+        + " |"
+        for name, by_spp in means.items()
+    ]
+    for metric, (value, ratio) in PAPER.items():
+        steps = levels(most)
+        lines += ["", f"{metric} over samples per pixel (paper: {value}, {ratio} of single):", ""]
+        lines += [
+            "| | " + " | ".join(map(str, steps)) + " | of single |",
+            "|---|" + "---|" * (len(steps) + 1),
+        ]
+        for name, by_spp in means.items():
+            cells = [f"{by_spp[spp][metric]:.4f}" if spp in by_spp else "" for spp in steps]
+            known = SINGLE in means and most in by_spp
+            cells.append(f"{by_spp[most][metric] / means[SINGLE][most][metric]:.2f}" if known else "")
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def plot(means: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
+    """FLIP over samples, with the paper's values as lines."""
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    for axes, (metric, (paper, _)) in zip(figure.subplots(1, 2), PAPER.items(), strict=True):
+        for name, by_spp in means.items():
+            style = {"color": "0.6", "linestyle": "--"} if name == AGAIN else {"marker": "."}
+            axes.loglog(list(by_spp), [row[metric] for row in by_spp.values()], label=name, **style)
+        axes.axhline(paper, color="k", linewidth=0.8, linestyle=":", label="paper, its own scene")
+        axes.set(xlabel="samples per pixel", ylabel=metric.replace("_", "-").upper())
+        axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(path, dpi=110)
+    print(f"{path}")
+
+
+def sheet(
+    pictures: dict[str, list[NDArray[np.float32]]],
+    flips: dict[str, dict[str, list[float]]],
+    materials: list[nma.materials.Material],
+    path: Path,
+) -> None:
+    """Materials at even steps of the best adapter's HDR-FLIP, from the worst to the median."""
+    shown = [name for name in flips if name != AGAIN]
+    best = nma.shipped()[-1]
+    worst_first = np.argsort(flips[best]["flip_hdr"])[::-1]
+    chosen = worst_first[np.unique(np.linspace(0, len(worst_first) // 2, ROWS).astype(int))]
+    caption = partial("HDR {:.4f}, LDR {:.4f}".format)
+    lines = [
+        Row(
+            studio.describe(materials[m]),
+            [pictures[SIMULATION][m][-1], *(pictures[name][m][-1] for name in shown)],
+            ["", *(caption(flips[name]["flip_hdr"][m], flips[name]["flip_ldr"][m]) for name in shown)],
+        )
+        for m in chosen
+    ]
+    note = f"FLIP; rows by that of {best}, worst first"
+    contact_sheet(path, lines, [SIMULATION, *shown], title="Rendered error on unseen materials", note=note)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Shader balls of unseen materials under light that shows a material and little noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import nma
+from nma.materials import Material
+from nma.render.load import load_dict
+from nma.render.progressive import render_passes
+from nma.render.scene import LAMP_RADIANCE
+
+# The soft box's side in those of the scene's lamp.
+SOFT_BOX = 7
+
+
+def material(number: int, params: NDArray[np.float64]) -> Material:
+    """A validation material by its place in the set."""
+    return Material.of_vector(f"validation-material-{number}", params, nma.LAYERED3)
+
+
+def describe(material: Material) -> str:
+    """A material's widths, optical depth and index in a line."""
+    short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
+    return short.format(material.title, **material.values)
+
+
+def render(
+    bsdf: dict[str, Any], size: int, spp: int, seed: int, sampler: str = "independent"
+) -> NDArray[np.float32]:
+    """A picture (size, size, 3) of the ball with this BSDF."""
+    return render_passes(load_dict(scene(bsdf, size, sampler)), spp, seed=seed)
+
+
+def scene(bsdf: dict[str, Any], size: int, sampler: str = "independent") -> dict[str, Any]:
+    """The preview scene under a sky without a sun and a soft box in place of the lamp, with one bounce of light: the
+    noise of small lights and caustics would hide what tells adapters apart."""
+    made = nma.preview_scene(bsdf, size=(size, size), hide_sun=True, max_depth=3)
+    made["sensor"]["sampler"]["type"] = sampler
+    made["lamp"]["to_world"] = made["lamp"]["to_world"].scale(SOFT_BOX)
+    radiance = [value / SOFT_BOX**2 for value in LAMP_RADIANCE]
+    made["lamp"]["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    return made
