@@ -32,5 +32,9 @@ def test_python_of_the_page_on_mitsuba_runs(number, tmp_path, monkeypatch):
     monkeypatch.setattr(mi.util, "write_bitmap", partial(mi.util.write_bitmap, write_async=False))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
-    exec(BLOCKS[number].replace("range(30)", "range(2)"), names)
+    variant = mi.variant() or "llvm_ad_rgb"
+    try:
+        exec(BLOCKS[number].replace("range(30)", "range(2)"), names)
+    finally:
+        mi.set_variant(variant)
     assert np.isfinite(np.array(names["image"])).all()
