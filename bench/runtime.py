@@ -24,6 +24,7 @@ from machine import header
 
 import nma
 from nma import native, network
+from nma.adapter import weights_file
 from nma.llvm import ensure_llvm
 
 HERE = Path(__file__).parent
@@ -66,8 +67,7 @@ def cpp() -> list[dict]:
         flags = ["-std=c++17", "-O2", "-march=native", f"-I{native.sources()}"]
         flags += [f"-isystem{EIGEN}"] if Path(EIGEN).exists() else []
         subprocess.run([native.compiler(), *flags, str(HERE / "runtime.cpp"), "-o", str(program)], check=True)
-        adapters = Path(nma.__file__).parent / "adapters"
-        words = [f"{name.split('-')[1]}={adapters / name}.safetensors" for name in nma.shipped()]
+        words = [f"{name.split('-')[1]}={weights_file(name)}" for name in nma.shipped()]
         run = subprocess.run([program, *words], capture_output=True, text=True, check=True)
     return [json.loads(line) for line in run.stdout.splitlines()]
 

@@ -12,6 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import nma
 from nma.metrics import table_metrics
 
@@ -67,6 +70,14 @@ def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
         partial.write_text(json.dumps(make()))
         partial.replace(path)
     return json.loads(path.read_text())
+
+
+def save_array(path: Path, array: NDArray) -> None:
+    """Writes an .npy file: whole or not at all, whenever the run is killed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial.npy")
+    np.save(partial, array)
+    partial.replace(path)
 
 
 def figures(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import nma
 from nma.materials import Material
@@ -26,6 +26,12 @@ def describe(material: Material) -> str:
     """A material's widths, optical depth and index in a line."""
     short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
     return short.format(material.title, **material.values)
+
+
+def worst_to_median(errors: ArrayLike, count: int) -> NDArray[np.intp]:
+    """Indices at even steps from the largest error to the median, fewer than `count` if there are not as many."""
+    worst_first = np.argsort(errors)[::-1]
+    return worst_first[np.unique(np.linspace(0, len(worst_first) // 2, count).astype(int))]
 
 
 def render(

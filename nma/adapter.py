@@ -40,6 +40,13 @@ def shipped() -> tuple[str, ...]:
     )
 
 
+def weights_file(name_or_path: str | Path) -> Path:
+    """The file of a shipped adapter's name, or the path as it is."""
+    if str(name_or_path) in shipped():
+        return Path(str(files("nma.adapters").joinpath(f"{name_or_path}.safetensors")))
+    return Path(name_or_path)
+
+
 @dataclass(frozen=True)
 class Adapter:
     """A trained network with all that belongs to it. `Adapter.load` reads one, `prepare` applies it.
@@ -59,10 +66,8 @@ class Adapter:
     @staticmethod
     def load(name_or_path: str | Path) -> Adapter:
         """A shipped adapter by name, or one from a weights file. Raises `WeightsError`."""
-        path = Path(name_or_path)
-        if str(name_or_path) in shipped():
-            path = Path(str(files("nma.adapters").joinpath(f"{name_or_path}.safetensors")))
-        elif path.suffix != ".safetensors" and not path.exists():
+        path = weights_file(name_or_path)
+        if path.suffix != ".safetensors" and not path.exists():
             raise WeightsError(
                 f"'{name_or_path}' is neither a file nor a shipped adapter ({', '.join(shipped())})"
             )

@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 from nma.errors import MissingDependencyError, NmaError
@@ -49,7 +50,7 @@ def mitsuba_folder() -> Path:
 
 
 def has_mitsuba_plugins() -> bool:
-    return all((mitsuba_folder() / "plugins" / f"{name}.so").exists() for name in PLUGINS)
+    return mitsuba_folder().exists()
 
 
 def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
@@ -66,7 +67,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         BuildError: the compiler refused.
     """
     folder = mitsuba_folder()
-    if has_mitsuba_plugins():
+    if folder.exists():
         say(f"{folder} is up to date")
         return folder
     mitsuba, drjit, nanobind = (_package(name) for name in ("mitsuba", "drjit", "nanobind"))
@@ -152,6 +153,7 @@ def _cache() -> Path:
     return Path(home) / "neural-material-adapter"
 
 
+@cache
 def _digest(*packages: str) -> str:
     """Of the sources, the shipped adapters, and the versions of these packages."""
     digest = hashlib.sha256()

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma import native
-from nma.adapter import shipped
+from nma.adapter import weights_file
 from nma.errors import ParamError, WeightsError
 
 Array = NDArray[np.float32]
@@ -58,12 +58,9 @@ class Runtime:
                 f"no instruction set {instruction_set!r}; there are {', '.join(INSTRUCTION_SETS)}"
             )
         self._library = _library()
-        path = Path(adapter)
-        if str(adapter) in shipped():
-            path = Path(__file__).parent / "adapters" / f"{adapter}.safetensors"
         number = INSTRUCTION_SETS.index(instruction_set) + (_COMPACT if compact else 0)
         message = ctypes.create_string_buffer(_MESSAGE)
-        handle = self._library.nma_load(str(path).encode(), number, message, _MESSAGE)
+        handle = self._library.nma_load(str(weights_file(adapter)).encode(), number, message, _MESSAGE)
         if not handle:
             raise WeightsError(message.value.decode())
         self._handle = ctypes.c_void_p(handle)

@@ -76,7 +76,6 @@ def main() -> None:
     arguments = parse()
     folder = common.results(__file__, arguments.quick)
     kept = common.ROOT / "out/figures/rendered" / ("quick" if arguments.quick else "pictures")
-    kept.mkdir(parents=True, exist_ok=True)
     count, population, seed = common.SETS["range"]
     params = nma.LAYERED3.sample(np.random.default_rng(seed), count, population)[: arguments.materials]
     materials = [studio.material(number, row) for number, row in enumerate(params)]
@@ -137,10 +136,9 @@ def gallery(
         for number, material in enumerate(materials):
             path = kept / f"{subject.key}_{size}px_{subject.spp}-spp_{number}.npy"
             if not path.exists():
-                # A whole file or none, whenever the run is killed.
-                partial_file = path.with_suffix(".partial.npy")
-                np.save(partial_file, converge(subject, subject.bsdf(material), size, earlier(path, subject)))
-                partial_file.replace(path)
+                common.save_array(
+                    path, converge(subject, subject.bsdf(material), size, earlier(path, subject))
+                )
             found.append(np.load(path))
             rate = bar.tasks[task].speed
             bar.update(task, advance=1, rate=f"{60 * rate:.1f}" if rate else "")
@@ -273,8 +271,7 @@ def sheet(
     """Materials at even steps of the best adapter's HDR-FLIP, from the worst to the median."""
     shown = [name for name in flips if name != AGAIN]
     best = nma.shipped()[-1]
-    worst_first = np.argsort(flips[best]["flip_hdr"])[::-1]
-    chosen = worst_first[np.unique(np.linspace(0, len(worst_first) // 2, ROWS).astype(int))]
+    chosen = studio.worst_to_median(flips[best]["flip_hdr"], ROWS)
     caption = partial("HDR {:.4f}, LDR {:.4f}".format)
     lines = [
         Row(

@@ -18,6 +18,7 @@ from nma.materials import Material
 from nma.render.load import material_bsdf
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
 import studio
 
 Images = NDArray[np.float32]
@@ -87,11 +88,7 @@ class Gallery:
         if path.exists() and (newer_than is None or path.stat().st_mtime > newer_than.stat().st_mtime):
             return np.load(path)
         pictures = np.stack([studio.render(bsdf(m), view.size, spp, seed) for m in self.materials])
-        path.parent.mkdir(exist_ok=True)
-        # A whole file or none, whenever the run is killed.
-        temporary = path.with_suffix(".partial.npy")
-        np.save(temporary, pictures)
-        temporary.replace(path)
+        common.save_array(path, pictures)
         print(f"{path.name}", flush=True)
         return pictures
 
@@ -108,8 +105,7 @@ def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int =
         name: [nma.compare_images(a, b)["flip_ldr"] for a, b in zip(images, gallery.reference, strict=True)]
         for name, images in pictures.items()
     }
-    worst_first = np.argsort(flips[next(iter(flips))])[::-1]
-    chosen = worst_first[np.unique(np.linspace(0, len(worst_first) // 2, rows).astype(int))]
+    chosen = studio.worst_to_median(flips[next(iter(flips))], rows)
     lines = [
         Row(
             studio.describe(gallery.materials[m]),

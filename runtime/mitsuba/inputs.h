@@ -13,6 +13,18 @@ namespace mitsuba::nma_plugin {
 
 using nma::SourceParam;
 
+// A vector of Mitsuba's for the runtime.
+template <class Vector>
+nma::Vec3<float> direction(const Vector& v) {
+    return {v.x(), v.y(), v.z()};
+}
+
+// Whether there is nothing to see: from behind, or with glossy reflection left out.
+template <class SurfaceInteraction3f>
+bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
+    return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
+}
+
 // One input: a texture, or numbers where there is none.
 template <class Float, class Spectrum>
 class Inputs {
@@ -32,6 +44,12 @@ public:
     }
 
     bool textured() const { return textured_; }
+
+    // Those of a one-sided glossy BSDF with these inputs.
+    auto flags() const {
+        const auto one_sided = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
+        return textured_ ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;
+    }
 
     // All parameters at `si`, one after the other.
     void at(const SurfaceInteraction3f& si, float* to) const {

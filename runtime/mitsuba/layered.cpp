@@ -18,8 +18,7 @@ public:
     MI_IMPORT_TYPES()
 
     explicit LayeredBSDF(const Properties& props) : Base(props), inputs_(props, nma::layered3_parameters(), false) {
-        m_flags = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
-        if (inputs_.textured()) m_flags = m_flags | BSDFFlags::SpatiallyVarying;
+        m_flags = inputs_.flags();
         m_components.push_back(m_flags);
     }
 
@@ -60,17 +59,11 @@ public:
     MI_DECLARE_CLASS(LayeredBSDF)
 
 private:
-    static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
-        return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
-    }
-
     nma::layered::Layers at(const SurfaceInteraction3f& si) const {
         float numbers[13];
         inputs_.at(si, numbers);
         return nma::layered::Layers::of(numbers);
     }
-
-    static nma::Vec3<float> direction(const Vector3f& v) { return {v.x(), v.y(), v.z()}; }
 
     // A stream of random numbers that depends on the bits of `numbers`.
     template <std::size_t N>

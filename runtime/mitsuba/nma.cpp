@@ -21,8 +21,7 @@ public:
         : Base(props), name_(props.get<std::string_view>("adapter", "layered3-5x64")), adapter_(load(name_, props.get<std::string_view>("precision", "float32"))),
           inputs_(props, adapter_.parameters(), props.get<bool>("clamp", false)) {
         const bool online = props.get<bool>("online", false);
-        m_flags = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
-        if (inputs_.textured()) m_flags = m_flags | BSDFFlags::SpatiallyVarying;
+        m_flags = inputs_.flags();
         m_components.push_back(m_flags);
         if (inputs_.textured() || online) return;
         float parameters[MOST_PARAMETERS];
@@ -82,10 +81,6 @@ private:
         }
     }
 
-    static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
-        return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
-    }
-
     nma::Material prepare(const SurfaceInteraction3f& si) const {
         const float cosine = nma::clip(static_cast<float>(si.wi.z()), 1e-4f, 1.0f);
         if (curves_) return curves_->at(cosine);
@@ -93,8 +88,6 @@ private:
         inputs_.at(si, parameters);
         return adapter_.prepare(parameters, cosine);
     }
-
-    static nma::Direction direction(const Vector3f& v) { return {v.x(), v.y(), v.z()}; }
 
     static std::pair<Spectrum, Float> evaluated(const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) {
         const nma::Value v = material.eval(direction(si.wi), direction(wo));
