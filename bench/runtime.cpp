@@ -82,7 +82,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
     report(network, "prepare", set, best([&] {
         for (int q = 0; q < QUERIES; ++q) {
             const nma::Material made = adapter.prepare(&queries.parameters[q * stride], queries.cosines[q]);
-            sink = made.blend().weights[0];
+            sink = made.blend().weight(0);
         }
     }));
     report(network, "inputs and network, batch", set, best([&] {
@@ -95,7 +95,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
     // What does not depend on the instruction set.
     const nma::Curves curves(adapter, queries.parameters.data());
     report(network, "curves", "any", best([&] {
-        for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weights[0];
+        for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weight(0);
     }));
     report(network, "eval and pdf", "any", best([&] {
         for (int q = 0; q < QUERIES; ++q) sink = materials[q].eval(queries.wi[q], queries.wo[q]).value.x;

@@ -28,7 +28,7 @@ Array = NDArray[np.float32]
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
 # Floats of an opaque material.
-_MATERIAL = 96
+_MATERIAL = 152
 _MESSAGE = 500
 
 

@@ -28,7 +28,7 @@ public:
     // f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both 0 below the horizon.
     Value eval(const Direction& wi, const Direction& wo) const {
         const Plane plane = Plane::of(wi, in_plane_);
-        return eval_pdf(prepared_, plane.enter(wi), plane.enter(wo));
+        return eval_pdf(blend_, plane.enter(wi), plane.enter(wo));
     }
 
     float pdf(const Direction& wi, const Direction& wo) const { return eval(wi, wo).pdf; }
@@ -36,12 +36,12 @@ public:
     // A direction from three uniform numbers in [0, 1), with its value and density; pdf == 0 marks an invalid one.
     Sampled sample(const Direction& wi, float u_lobe, float u1, float u2) const {
         const Plane plane = Plane::of(wi, in_plane_);
-        Sampled found = nma::sample(prepared_, plane.enter(wi), u_lobe, u1, u2);
+        Sampled found = nma::sample(blend_, plane.enter(wi), u_lobe, u1, u2);
         found.wo = plane.leave(found.wo);
         return found;
     }
 
-    const Blend<float>& blend() const { return prepared_.blend; }
+    const Blend<float>& blend() const { return blend_; }
 
 private:
     friend class Adapter;
@@ -59,7 +59,7 @@ private:
         Direction leave(const Direction& v) const { return {cos_phi * v.x - sin_phi * v.y, sin_phi * v.x + cos_phi * v.y, v.z}; }
     };
 
-    Prepared<float> prepared_;
+    Blend<float> blend_;
     bool in_plane_ = false;
 };
 
@@ -98,24 +98,25 @@ public:
 
     // The blend for the parameters of the source material at cos(theta_i).
     Material prepare(const float* parameters, float cos_theta_i) const {
-        alignas(64) float numbers[WIDEST_LAYER];
+        alignas(64) float numbers[WIDEST_LAYER + 1];
         network_outputs(parameters, cos_theta_i, numbers);
         return decoded(numbers, cos_theta_i);
     }
 
     // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
     void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
-        alignas(64) float outputs[BLOCK * WIDEST_LAYER];
+        alignas(64) float outputs[BLOCK * WIDEST_LAYER + 1];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
             outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count_, cos_theta_i + first, outputs);
-            for (int q = 0; q < now; ++q) materials[first + q] = decoded(outputs + q * network_.output_stride(), cos_theta_i[first + q]);
+            // The last one first: a material's numbers end where those of the next query begin.
+            for (int q = now - 1; q >= 0; --q) materials[first + q] = decoded(outputs + q * network_.output_stride(), cos_theta_i[first + q]);
         }
     }
 
     // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
     void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
-        alignas(64) float inputs[WIDEST_LAYER];
+        alignas(64) float inputs[WIDEST_LAYER + LANES];
         encode(parameters, cos_theta_i, inputs);
         network_.forward(inputs, raw);
     }
@@ -140,9 +141,11 @@ private:
         for (const SourceParam& p : weights_.parameters) parameter_count_ += p.size;
         for (const TargetParam& p : weights_.target) add_fields(p);
         encoding_ = encoding_named(weights_.encoding);
-        output_count_ = static_cast<int>(offsets_.size()) * weights_.instances + weights_.instances - 1;
+        output_count_ = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
         check();
+        if (encoding_ == Encoding::Layered3) scale_ = scale_of(weights_.parameters);
         lay_out_ranges();
+        lay_out_lanes();
         weights_.layers.clear();
     }
 
@@ -153,7 +156,7 @@ private:
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
-    // Remembers where in a `Principled` the numbers of a parameter go.
+    // Remembers which fields of a `Principled` the numbers of a parameter become.
     void add_fields(const TargetParam& p) {
         using P = Principled<float>;
         static constexpr std::pair<const char*, std::size_t> FIELDS[] = {
@@ -164,7 +167,7 @@ private:
         in_plane_ |= p.in_plane;
         for (const auto& [name, offset] : FIELDS)
             if (p.name == name && p.size == (p.name == "base_color" ? 3 : 1)) {
-                for (int c = 0; c < p.size; ++c) offsets_.push_back(offset + c * sizeof(float));
+                for (int c = 0; c < p.size; ++c) fields_.push_back(static_cast<int>(offset / sizeof(float)) + c);
                 return;
             }
         throw Error("unknown target parameter '" + p.name + "'; upgrade the runtime");
@@ -200,8 +203,16 @@ private:
         std::fill(span + next, span + count, 1.0f);
     }
 
+    // Which number each lane of each field takes; those without one take the number after all others, which is 0.
+    void lay_out_lanes() {
+        const int size = static_cast<int>(fields_.size()), per_pack = Blend<float>::FIELDS * LANES;
+        lane_index_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, network_.output_stride());
+        for (int k = 0; k < weights_.instances; ++k)
+            for (int f = 0; f < size; ++f) lane_index_[k / LANES * per_pack + fields_[f] * LANES + k % LANES] = k * size + f;
+    }
+
     void outputs_of_block(int count, const float* parameters, const float* cos_theta_i, float* outputs) const {
-        alignas(64) float inputs[BLOCK * WIDEST_LAYER];
+        alignas(64) float inputs[BLOCK * WIDEST_LAYER + LANES];
         for (int q = 0; q < count; ++q) encode(parameters + q * parameter_count_, cos_theta_i[q], inputs + q * network_.input_stride());
         network_.forward_many(count, inputs, outputs);
     }
@@ -221,35 +232,46 @@ private:
     }
 
     float* encode_layered3(const float* p, float cosine, float* x) const {
+        using Four = Lanes<float>;
         constexpr float GRAZING = 0.1045f;
-        const float *eta = p + 3, *k = p + 6, *albedo = p + 9;
-        const float eta_top = p[2], sigma_t = p[12];
-        const auto& declared = weights_.parameters;
-        float* next = x;
-        *next++ = normalised(declared[0], p[0]);
-        *next++ = normalised(declared[1], p[1]);
-        *next++ = normalised(declared[2], eta_top);
-        *next++ = normalised(declared[6], sigma_t);
-        const float inside = 1.0f / eta_top;
-        for (int c = 0; c < 3; ++c) {
-            // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
-            const float n = eta[c] * inside, k2 = k[c] * inside * (k[c] * inside);
-            next[c] = ((n - 1.0f) * (n - 1.0f) + k2) / ((n + 1.0f) * (n + 1.0f) + k2);
-            next[c + 3] = fresnel_conductor<float>(GRAZING, n, k[c] * inside);
-        }
-        next += 6;
-        for (int c = 0; c < 3; ++c) *next++ = albedo[c];
-        if (weights_.directional) {
-            const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
-            *next++ = cosine;
-            *next++ = fresnel;
-            *next++ = std::exp(-sigma_t / maximum(cos_t, 0.05f));
-        }
-        for (float* unit = x; unit != next; ++unit) *unit = 2.0f * *unit - 1.0f;
-        return next;
+        const float sigma_t = p[12];
+        const Four one(1.0f), inside(1.0f / p[2]);
+        const Four plain{p[0], p[1], p[2], sigma_t};
+        const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * scale_.log;
+        // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
+        const Four n = Four(p[3], p[4], p[5], 1.0f) * inside, k = Four(p[6], p[7], p[8], 0.0f) * inside, k2 = k * k;
+        const Four less = n - one, more = n + one;
+        x = put(x, (bent - scale_.start) * scale_.per_range, 4);
+        x = put(x, (less * less + k2) / (more * more + k2), 3);
+        x = put(x, fresnel_conductor<Four>(Four(GRAZING), n, k), 3);
+        x = put(x, {p[9], p[10], p[11], 0.0f}, 3);
+        if (!weights_.directional) return x;
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
+        return put(x, {cosine, fresnel, std::exp(-sigma_t / maximum(cos_t, 0.05f)), 0.0f}, 3);
     }
 
-    static float normalised(const SourceParam& p, float value) { return ((p.logarithmic ? std::log(value) : value) - p.start) * p.per_range; }
+    // The first `count` of four numbers, from 0 .. 1 to -1 .. 1; there is room for all four.
+    static float* put(float* x, const Lanes<float>& units, int count) {
+        const Lanes<float> spread = units + units - Lanes<float>(1.0f);
+        std::memcpy(x, &spread, sizeof(spread));
+        return x + count;
+    }
+
+    // How the four scalar parameters of `layered3` become units.
+    struct Scale {
+        Lanes<float> log{0.0f}, start{0.0f}, per_range{0.0f};
+    };
+
+    static Scale scale_of(const std::vector<SourceParam>& all) {
+        Scale made;
+        int k = 0;
+        for (const SourceParam* p : {&all[0], &all[1], &all[2], &all[6]}) {
+            made.log.set(k, p->logarithmic);
+            made.start.set(k, p->start);
+            made.per_range.set(k++, p->per_range);
+        }
+        return made;
+    }
 
     // The material of the network's outputs, which become its numbers. Twin of nma/target/decode.py.
     Material decoded(float* raw, float cosine) const {
@@ -257,34 +279,40 @@ private:
         return material(raw, cosine);
     }
 
-    // From the numbers of all instances and the shares of the blend.
-    Material material(const float* numbers, float cosine) const {
+    // From the numbers of all instances and the shares of the blend; there is room for a number after them.
+    Material material(float* numbers, float cosine) const {
         Material made;
-        Blend<float>& blend = made.prepared_.blend;
+        Blend<float>& blend = made.blend_;
         blend.count = weights_.instances;
-        for (int k = 0; k < blend.count; ++k) {
-            Principled<float>& instance = blend.instances[k];
-            instance.anisotropic = instance.flatness = 0.0f;
-            for (const std::size_t offset : offsets_) std::memcpy(reinterpret_cast<char*>(&instance) + offset, numbers++, sizeof(float));
-        }
+        blend.scale = {1.0f, 1.0f, 1.0f};
+        numbers[network_.output_stride()] = 0.0f;
+        const int* index = lane_index_.data();
+        const float* share = numbers + output_count_ - (blend.count - 1);
         float left = 1.0f;
-        for (int k = 0; k + 1 < blend.count; ++k) {
-            const float share = *numbers++;
-            blend.weights[k] = left * share;
-            left *= 1.0f - share;
+        for (int n = 0; n < blend.used(); ++n) {
+            Pack<float>& pack = blend.packs[n];
+            auto* lanes = reinterpret_cast<Lanes<float>*>(&pack.instances);
+            for (int f = 0; f < Blend<float>::FIELDS; ++f, index += LANES) lanes[f] = {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
+            float weights[LANES] = {};
+            for (int k = n * LANES; k < std::min(blend.count, (n + 1) * LANES); ++k) {
+                const float part = k + 1 < blend.count ? *share++ : 1.0f;
+                weights[k % LANES] = left * part;
+                left -= left * part;
+            }
+            pack.weights = {weights[0], weights[1], weights[2], weights[3]};
         }
-        blend.weights[blend.count - 1] = left;
-        weigh(made.prepared_, cosine, weights_.bounded);
+        weigh(blend, cosine, weights_.bounded);
         made.in_plane_ = in_plane_;
         return made;
     }
 
     Weights weights_;
     Network network_;
-    std::vector<std::size_t> offsets_;
+    std::vector<int> fields_, lane_index_;
     std::unique_ptr<float[], detail::FreeAligned> ranges_memory_;
     Ranges ranges_{};
     Encoding encoding_ = Encoding::Raw;
+    Scale scale_;
     int parameter_count_ = 0, output_count_ = 0;
     bool in_plane_ = false;
 };
@@ -295,34 +323,35 @@ public:
     // As many as nma/render/curves.py has.
     static constexpr int NODES = 128;
 
-    Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) : adapter_(&adapter), nodes_(std::max(nodes, 2)) {
-        const int stride = adapter.network_.output_stride();
-        numbers_.resize(static_cast<std::size_t>(nodes_) * stride);
-        alignas(64) float raw[WIDEST_LAYER];
-        for (int n = 0; n < nodes_; ++n) {
-            const float cosine = maximum(static_cast<float>(n) / static_cast<float>(nodes_ - 1), 1e-4f);
-            adapter.network_outputs(parameters, cosine, raw);
-            adapter.network_.kernels_in_use().decode(adapter.ranges_, raw, 1.0f - cosine * cosine);
-            std::copy_n(raw, stride, numbers_.begin() + static_cast<std::ptrdiff_t>(n) * stride);
+    Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
+        for (int n = 0; n < std::max(nodes, 2); ++n) {
+            const float cosine = static_cast<float>(n) / static_cast<float>(std::max(nodes, 2) - 1);
+            nodes_.push_back(adapter.prepare(parameters, maximum(cosine, 1e-4f)));
         }
     }
 
-    // The adapter must outlive the curves.
+    // Weights and odds of both neighbours sum to one, and so do those between them.
     Material at(float cos_theta_i) const {
-        const int stride = adapter_->network_.output_stride();
-        const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_ - 1);
-        const int left = std::min(static_cast<int>(position), nodes_ - 2);
-        const float t = position - static_cast<float>(left);
-        const float *a = numbers_.data() + static_cast<std::ptrdiff_t>(left) * stride, *b = a + stride;
-        float numbers[WIDEST_LAYER];
-        for (int k = 0; k < stride; ++k) numbers[k] = lerp(a[k], b[k], t);
-        return adapter_->material(numbers, cos_theta_i);
+        const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
+        const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
+        const Lanes<float> t = position - static_cast<float>(left);
+        const Blend<float> &a = nodes_[left].blend_, &b = nodes_[left + 1].blend_;
+        Material made;
+        made.in_plane_ = nodes_[left].in_plane_;
+        made.blend_.count = a.count;
+        made.blend_.scale = a.scale + (b.scale - a.scale) * t[0];
+        for (int n = 0; n < a.used(); ++n) {
+            const auto *from = lanes(a.packs[n]), *to = lanes(b.packs[n]);
+            auto* between = const_cast<Lanes<float>*>(lanes(made.blend_.packs[n]));
+            for (std::size_t k = 0; k < sizeof(Pack<float>) / sizeof(Lanes<float>); ++k) between[k] = lerp(from[k], to[k], t);
+        }
+        return made;
     }
 
 private:
-    const Adapter* adapter_;
-    int nodes_;
-    std::vector<float> numbers_;
+    static const Lanes<float>* lanes(const Pack<float>& pack) { return reinterpret_cast<const Lanes<float>*>(&pack); }
+
+    std::vector<Material> nodes_;
 };
 
 // Batches of `Material::eval` and `Material::sample`; `u` holds three uniform numbers for each.

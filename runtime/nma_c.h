@@ -23,9 +23,15 @@ extern "C" {
 typedef struct nma_adapter nma_adapter;
 typedef struct nma_curves nma_curves;
 
-/* A material at one shading point. */
+#if defined(_MSC_VER)
+#define NMA_ALIGNED __declspec(align(16))
+#else
+#define NMA_ALIGNED __attribute__((aligned(16)))
+#endif
+
+/* A material at one shading point, on a boundary of 16 bytes. */
 typedef struct {
-    float opaque[96];
+    NMA_ALIGNED float opaque[152];
 } nma_material;
 
 /* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to one
@@ -47,7 +53,7 @@ NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const flo
 /* Raw outputs of the network, `nma_output_count` for each query. */
 NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, float* outputs);
 
-/* Curves of an untextured material; the adapter must outlive them. */
+/* Curves of an untextured material. */
 NMA_C_API nma_curves* nma_curves_new(const nma_adapter* adapter, const float* parameters);
 NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material);
 NMA_C_API void nma_curves_free(nma_curves* curves);

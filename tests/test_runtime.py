@@ -29,7 +29,7 @@ CASES = 4000
 SETS = ["fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16"]
 COMPACT = 0x100
 # Floats of an opaque material.
-MATERIAL = 96
+MATERIAL = 152
 
 
 @pytest.fixture(scope="module")

@@ -3,25 +3,59 @@
 // Directions are unit vectors in the local frame, z up, `wi` towards the viewer and `wo` towards the light.
 #pragma once
 
+#include "lanes.h"
 #include "target.h"
 
 namespace nma {
 
-constexpr int MAX_INSTANCES = 5;
-
-// Instances and their weights, which sum to one; `scale` dims the whole (see `bound`).
-template <class T>
-struct Blend {
-    int count = 0;
-    Principled<T> instances[MAX_INSTANCES];
-    T weights[MAX_INSTANCES];
-    Vec3<T> scale{T(1), T(1), T(1)};
-};
+constexpr int MAX_PACKS = 2, MAX_INSTANCES = MAX_PACKS * LANES;
 
 // Chance of each lobe of an instance.
 template <class T>
 struct Odds {
     T diffuse, spec, clearcoat;
+};
+
+// Four instances side by side, with their weights and odds. A lane without an instance holds zeros.
+template <class T>
+struct Pack {
+    Principled<Lanes<T>> instances;
+    Lanes<T> weights;
+    Odds<Lanes<T>> odds;
+};
+
+// Instances and their weights, which sum to one. `weigh` fills in the odds, and `scale`, which dims the whole.
+template <class T>
+struct Blend {
+    int count = 0;
+    Pack<T> packs[MAX_PACKS];
+    Vec3<T> scale;
+
+    Blend() = default;
+    explicit Blend(int instances) : count(instances), scale{T(1), T(1), T(1)} { std::fill_n(packs, used(), Pack<T>{}); }
+
+    // Packs that hold instances.
+    int used() const { return (count + LANES - 1) / LANES; }
+
+    void set(int k, const Principled<T>& instance, T weight) {
+        static_assert(sizeof(Principled<Lanes<T>>) == FIELDS * sizeof(Lanes<T>));
+        Pack<T>& pack = packs[k / LANES];
+        const auto* from = reinterpret_cast<const T*>(&instance);
+        auto* to = reinterpret_cast<Lanes<T>*>(&pack.instances);
+        for (int f = 0; f < FIELDS; ++f) to[f].set(k % LANES, from[f]);
+        pack.weights.set(k % LANES, weight);
+    }
+    Principled<T> instance(int k) const {
+        Principled<T> found;
+        const auto* from = reinterpret_cast<const Lanes<T>*>(&packs[k / LANES].instances);
+        auto* to = reinterpret_cast<T*>(&found);
+        for (int f = 0; f < FIELDS; ++f) to[f] = from[f][k % LANES];
+        return found;
+    }
+    T weight(int k) const { return packs[k / LANES].weights[k % LANES]; }
+
+    // Numbers that describe an instance.
+    static constexpr int FIELDS = sizeof(Principled<T>) / sizeof(T);
 };
 
 // A value f cos(theta_o) [1/sr] and the density of `sample` [1/sr].
@@ -39,84 +73,81 @@ struct Sample {
     T pdf;
 };
 
-// A blend with the odds of its lobes at one cos(theta_i): what a shading point keeps.
-template <class T>
-struct Prepared {
-    Blend<T> blend;
-    Odds<T> odds[MAX_INSTANCES];
-};
-
 // Works out the odds of a blend's lobes at cos(theta_i), and with `bounded` dims it where it might reflect more light than
 // it receives.
 template <class T>
-inline void weigh(Prepared<T>& prepared, T cos_theta_i, bool bounded) {
-    Blend<T>& blend = prepared.blend;
-    const T cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
+inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
+    const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
     Vec3<T> albedo{T(0), T(0), T(0)};
     T total = T(0);
-    for (int k = 0; k < blend.count; ++k) {
-        const Albedos<T> a = lobe_albedos<T>(blend.instances[k], cosine);
-        const T w = blend.weights[k];
-        Odds<T>& o = prepared.odds[k];
-        o = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
-        albedo = albedo + (a.diffuse + a.spec + a.clearcoat) * w;
-        total += o.diffuse + o.spec + o.clearcoat;
+    for (int n = 0; n < blend.used(); ++n) {
+        Pack<T>& pack = blend.packs[n];
+        const Albedos<Lanes<T>> a = lobe_albedos<Lanes<T>>(pack.instances, cosine);
+        const Lanes<T> w = pack.weights;
+        pack.odds = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
+        albedo = albedo + sum((a.diffuse + a.spec + a.clearcoat) * w);
+        total += sum(pack.odds.diffuse + pack.odds.spec + pack.odds.clearcoat);
     }
-    const T share = T(1) / total;
-    for (int k = 0; k < blend.count; ++k) {
-        Odds<T>& o = prepared.odds[k];
+    const Lanes<T> share = T(1) / total;
+    for (int n = 0; n < blend.used(); ++n) {
+        Odds<Lanes<T>>& o = blend.packs[n].odds;
         o = {o.diffuse * share, o.spec * share, o.clearcoat * share};
     }
     if (bounded) blend.scale = {T(1) / maximum(albedo.x, T(1)), T(1) / maximum(albedo.y, T(1)), T(1) / maximum(albedo.z, T(1))};
 }
 
+// The same geometry for every lane.
 template <class T>
-inline Prepared<T> prepare(const Blend<T>& blend, T cos_theta_i, bool bounded) {
-    Prepared<T> made{blend, {}};
-    weigh(made, cos_theta_i, bounded);
-    return made;
+inline Geometry<Lanes<T>> spread(const Geometry<T>& g) {
+    const auto all = [](const Vec3<T>& v) { return Vec3<Lanes<T>>{v.x, v.y, v.z}; };
+    return {g.valid, all(g.wi), all(g.wo), all(g.h), g.cos_d, g.weight_i, g.weight_o, g.weight_d, g.clearcoat};
 }
 
 // f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both zero below the horizon.
 template <class T>
-inline Evaluation<T> eval_pdf(const Prepared<T>& prepared, const Vec3<T>& wi, const Vec3<T>& wo) {
+inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
     Evaluation<T> result;
     const Geometry<T> g = geometry<T>(wi, wo);
     if (!g.valid) return result;
-    for (int k = 0; k < prepared.blend.count; ++k) {
-        const Lobes<T> lobes = eval_pdf_lobes<T>(prepared.blend.instances[k], g);
-        const Odds<T>& odds = prepared.odds[k];
-        result.value = result.value + lobes.value * prepared.blend.weights[k];
-        result.pdf += odds.diffuse * lobes.diffuse_pdf + odds.spec * lobes.spec_pdf + odds.clearcoat * lobes.clearcoat_pdf;
+    const Geometry<Lanes<T>> wide = spread(g);
+    for (int n = 0; n < blend.used(); ++n) {
+        const Pack<T>& pack = blend.packs[n];
+        const Lobes<Lanes<T>> lobes = eval_pdf_lobes<Lanes<T>>(pack.instances, wide);
+        result.value = result.value + sum(lobes.value * pack.weights);
+        result.pdf += sum(pack.odds.diffuse * lobes.diffuse_pdf + pack.odds.spec * lobes.spec_pdf + pack.odds.clearcoat * lobes.clearcoat_pdf);
     }
-    result.value = result.value * prepared.blend.scale;
+    result.value = result.value * blend.scale;
     return result;
+}
+
+// The instance that `u` falls to when each takes its share from `start` on, which moves to the end of that share; `count`
+// if there is none.
+template <class T>
+inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::*lobe, T u, T& start) {
+    int k = 0;
+    while (k < blend.count && u >= (start += (blend.packs[k / LANES].odds.*lobe)[k % LANES])) ++k;
+    return k;
 }
 
 // A direction from three uniform numbers in [0, 1), with `eval_pdf` of it.
 template <class T>
-inline Sample<T> sample(const Prepared<T>& prepared, const Vec3<T>& wi, T u_lobe, T u1, T u2) {
+inline Sample<T> sample(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1, T u2) {
     if (!(wi.z > MIN_COS<T>)) return {{T(0), T(0), T(1)}, {T(0), T(0), T(0)}, T(0)};
-    const int count = prepared.blend.count;
     // All diffuse lobes come first, then all specular ones, then the clearcoats.
     T end = T(0);
-    for (int k = 0; k < count; ++k) end += prepared.odds[k].diffuse;
+    for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].odds.diffuse);
     Vec3<T> wo;
     if (u_lobe < end) {
         wo = sample_diffuse<T>(u1, u2);
+    } else if (int k = chosen(blend, &Odds<Lanes<T>>::spec, u_lobe, end); k < blend.count) {
+        const Principled<Lanes<T>>& p = blend.packs[k / LANES].instances;
+        const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness[k % LANES], p.anisotropic[k % LANES]);
+        wo = sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
     } else {
-        int k = 0;
-        while (k < count && u_lobe >= (end += prepared.odds[k].spec)) ++k;
-        if (k < count) {
-            const auto [alpha_x, alpha_y] = spec_alpha<T>(prepared.blend.instances[k].roughness, prepared.blend.instances[k].anisotropic);
-            wo = sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
-        } else {
-            k = 0;
-            while (k < count - 1 && u_lobe >= (end += prepared.odds[k].clearcoat)) ++k;
-            wo = sample_clearcoat<T>(wi, clearcoat_alpha<T>(prepared.blend.instances[k].clearcoat_gloss), u1, u2);
-        }
+        k = std::min(chosen(blend, &Odds<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);
+        wo = sample_clearcoat<T>(wi, clearcoat_alpha<T>(blend.packs[k / LANES].instances.clearcoat_gloss[k % LANES]), u1, u2);
     }
-    const Evaluation<T> found = eval_pdf(prepared, wi, wo);
+    const Evaluation<T> found = eval_pdf(blend, wi, wo);
     return {wo, found.value, found.pdf};
 }
 

@@ -1,0 +1,116 @@
+// Four numbers side by side: the target's functions take them for T, and so evaluate four instances at once.
+//
+// Floats are vectors of the CPU's baseline where the compiler has them (GCC, Clang); anything else is a loop.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#include "math.h"
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
+namespace nma {
+
+constexpr int LANES = 4;
+
+namespace detail {
+
+// Four numbers without help of the compiler.
+template <class T>
+struct Four {
+    T lane[LANES];
+
+    T& operator[](int k) { return lane[k]; }
+    constexpr T operator[](int k) const { return lane[k]; }
+};
+
+template <class T, class F>
+inline Four<T> each(F function) {
+    return {{function(0), function(1), function(2), function(3)}};
+}
+template <class T> inline Four<T> operator+(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] + b[k]; }); }
+template <class T> inline Four<T> operator-(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] - b[k]; }); }
+template <class T> inline Four<T> operator*(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] * b[k]; }); }
+template <class T> inline Four<T> operator/(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] / b[k]; }); }
+template <class T> inline Four<T> least(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return minimum(a[k], b[k]); }); }
+template <class T> inline Four<T> most(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return maximum(a[k], b[k]); }); }
+template <class T> inline Four<T> roots(const Four<T>& a) { return each<T>([&](int k) { return std::sqrt(a[k]); }); }
+template <class T> inline Four<T> logarithms(const Four<T>& a) { return each<T>([&](int k) { return std::log(a[k]); }); }
+
+template <class T>
+struct Storage {
+    using Type = Four<T>;
+};
+
+#if defined(__GNUC__)
+typedef float Floats __attribute__((vector_size(16)));
+typedef std::int32_t Whole __attribute__((vector_size(16)));
+
+template <>
+struct Storage<float> {
+    using Type = Floats;
+};
+
+inline Floats least(Floats a, Floats b) { return b < a ? b : a; }
+inline Floats most(Floats a, Floats b) { return a < b ? b : a; }
+inline Floats roots(Floats a) {
+#if defined(__SSE2__)
+    return (Floats)_mm_sqrt_ps((__m128)a);
+#elif defined(__aarch64__)
+    return (Floats)vsqrtq_f32((float32x4_t)a);
+#else
+    return Floats{std::sqrt(a[0]), std::sqrt(a[1]), std::sqrt(a[2]), std::sqrt(a[3])};
+#endif
+}
+
+// To two units in the last place for normal numbers; 0 becomes a number below -88. The mantissa is brought to
+// sqrt(1/2) .. sqrt(2), and log(m) is 2 artanh(s), s = (m - 1) / (m + 1), as a series.
+inline Floats logarithms(Floats a) {
+    const Whole bits = (Whole)a, halves = (bits - 0x3f3504f3) >> 23;
+    const Floats m = (Floats)(bits - (halves << 23)), exponent = __builtin_convertvector(halves, Floats);
+    const Floats s = (m - 1.0f) / (m + 1.0f), s2 = s * s;
+    const Floats series = s2 * (0.666666667f + s2 * (0.4f + s2 * (0.285714286f + s2 * 0.222222222f)));
+    return exponent * 0.693147181f + (2.0f * s + s * series);
+}
+#endif
+
+}  // namespace detail
+
+template <class T>
+struct Lanes {
+    typename detail::Storage<T>::Type v;
+
+    Lanes() = default;
+    constexpr Lanes(T x) : v{x, x, x, x} {}
+    constexpr Lanes(T a, T b, T c, T d) : v{a, b, c, d} {}
+    constexpr Lanes(typename detail::Storage<T>::Type four) : v(four) {}
+
+    T operator[](int k) const { return v[k]; }
+    void set(int k, T x) { v[k] = x; }
+    Lanes& operator+=(const Lanes& a) { return *this = v + a.v; }
+};
+
+template <class T> constexpr Lanes<T> PI<Lanes<T>> = Lanes<T>(PI<T>);
+template <class T> constexpr Lanes<T> INV_PI<Lanes<T>> = Lanes<T>(INV_PI<T>);
+
+template <class T> inline Lanes<T> operator+(const Lanes<T>& a, const Lanes<T>& b) { return a.v + b.v; }
+template <class T> inline Lanes<T> operator-(const Lanes<T>& a, const Lanes<T>& b) { return a.v - b.v; }
+template <class T> inline Lanes<T> operator*(const Lanes<T>& a, const Lanes<T>& b) { return a.v * b.v; }
+template <class T> inline Lanes<T> operator/(const Lanes<T>& a, const Lanes<T>& b) { return a.v / b.v; }
+template <class T> inline Lanes<T> operator-(const Lanes<T>& a) { return Lanes<T>(T(0)) - a; }
+
+template <class T> inline Lanes<T> minimum(const Lanes<T>& a, const Lanes<T>& b) { return detail::least(a.v, b.v); }
+template <class T> inline Lanes<T> maximum(const Lanes<T>& a, const Lanes<T>& b) { return detail::most(a.v, b.v); }
+template <class T> inline Lanes<T> sqrt(const Lanes<T>& a) { return detail::roots(a.v); }
+template <class T> inline Lanes<T> log(const Lanes<T>& a) { return detail::logarithms(a.v); }
+template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(maximum(a, Lanes<T>(T(0)))); }
+
+template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
+template <class T> inline Vec3<T> sum(const Vec3<Lanes<T>>& a) { return {sum(a.x), sum(a.y), sum(a.z)}; }
+
+}  // namespace nma
