@@ -41,8 +41,16 @@ def results(script: str, quick: bool) -> Path:
 
 
 def write_json(path: Path, data: Any) -> None:
-    path.write_text(json.dumps(data, indent=1) + "\n")
+    write_text(path, json.dumps(data, indent=1) + "\n")
     print(f"{path}")
+
+
+def write_text(path: Path, text: str) -> None:
+    """A whole file or none, whenever the run is killed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(text)
+    partial.replace(path)
 
 
 def reference(name: str, quick: bool) -> nma.Tables:
@@ -64,11 +72,7 @@ def reference(name: str, quick: bool) -> nma.Tables:
 def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
     """What `make` returned when it was first called for this JSON file, or returns now."""
     if again or not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # A whole file or none, whenever the run is killed.
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(make()))
-        partial.replace(path)
+        write_text(path, json.dumps(make()))
     return json.loads(path.read_text())
 
 

@@ -27,8 +27,8 @@ Array = NDArray[np.float32]
 # As nma_c.h numbers them.
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
-# Floats of an opaque material.
-_MATERIAL = 152
+# Floats of an opaque material, and the boundary in bytes that it lies on.
+_MATERIAL, _ALIGNMENT = 152, 16
 _MESSAGE = 500
 
 
@@ -114,7 +114,7 @@ def _rows(name: str, values: ArrayLike, width: int) -> Array:
     array = np.ascontiguousarray(values, np.float32)
     if array.shape[1:] != ((width,) if width else ()) or array.ndim != (2 if width else 1):
         raise ParamError(f"{name} wants shape {f'(n, {width})' if width else '(n,)'}, got {array.shape}")
-    return array
+    return array if array.ctypes.data % _ALIGNMENT == 0 else array.copy()
 
 
 def _pointer(array: Array) -> Any:

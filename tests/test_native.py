@@ -195,6 +195,10 @@ def test_python_reaches_the_batched_kernel(tmp_path):
     again, density = runtime.eval(materials, wi, wo)
     np.testing.assert_allclose(again[pdf > 0], value[pdf > 0], rtol=1e-6)
     np.testing.assert_allclose(density[pdf > 0], pdf[pdf > 0], rtol=1e-6)
+    # Rows that lie on no boundary of 16 bytes.
+    shifted = np.empty(materials.size + 1, np.float32)[1:].reshape(materials.shape)
+    shifted[:] = materials
+    np.testing.assert_array_equal(runtime.eval(shifted, wi, wo)[0], again)
 
     with pytest.raises(nma.errors.WeightsError, match="no such weights file"):
         Runtime(tmp_path / "none.safetensors")
