@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -14,10 +15,13 @@ def header() -> str:
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        lines = [
-            line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line
+        # The name alone says little on virtual machines: family 25 of AMD is Zen 3 and 4, family 26 Zen 5.
+        fields = dict(re.findall(r"^(.*?)\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE))
+        names = [
+            fields.get("model name"),
+            *(f"{n} {fields[n]}" for n in ("cpu family", "model") if n in fields),
         ]
-        model = lines[0] if lines else model
+        model = ", ".join(name for name in names if name) or model
     load = "{:.2f} {:.2f} {:.2f}".format(*os.getloadavg())
     return (
         f"machine  {model}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}\n"

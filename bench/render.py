@@ -1,6 +1,6 @@
 """Time, variance and error of `principled`, `layered` and `nma` in the preview scene, without textures and with three.
 
-    python bench/render.py [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--output out/bench]
+    python bench/render.py [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
 
 Frames of all BSDFs take turns, so that other load on the machine meets all of them; `load` is its average at start
 and end. `time` is the median wall time of a frame and `cpu` the median of its processor seconds, without
@@ -9,7 +9,7 @@ compilation. The ratios are medians over rounds of a frame's time to that of `pr
 that of one frame, mean over pixels and channels, from independent seeds; `efficiency` 1 / (variance x time). `bias`
 is the root mean square of (expected picture - that of `layered`), from products of independent renderings, or what
 it lies below if it does not stand out of the noise. `smape` compares the mean of the frames with the reference,
-noise of both included: the line of `layered` shows how much that is. `principled` is a stand- in for its time and
+noise of both included: the line of `layered` shows how much that is. `principled` is a stand-in for its time and
 noise; it shows another material.
 
 Writes render.json and render.png: the expected error after a time, from the variance and the bias.
@@ -19,32 +19,24 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import os
-import resource
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import emptycache  # noqa: F401
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+import frames
 import numpy as np
-from machine import header
-from numpy.typing import NDArray
+import scenes
+from frames import Array, Frames
+from matplotlib.figure import Figure
 
-import nma.render
 from nma import materials
 from nma.adapter import shipped
 from nma.image_metrics import errors
-from nma.render.load import load_dict, material_bsdf
-from nma.render.measure import render_seconds
+from nma.render.load import load_dict
 from nma.render.progressive import render_passes
-from nma.render.scene import bitmap_texture, material_coverage, preview_scene
-from nma.render.textures import procedural_textures
+from nma.render.scene import material_coverage
 
-DEPTH = 6
 ADAPTERS = ("layered3-5x64", "layered3-3x32")
 COLUMNS = "  ".join(
     (
@@ -52,130 +44,80 @@ COLUMNS = "  ".join(
         f"{'variance':>9} {'efficiency':>10} {'bias':>8} {'smape':>7}",
     )
 )
-Array = NDArray[np.float64]
-
-
-class Frames(NamedTuple):
-    """Everything about one BSDF in one of the scenes: pictures (runs, height, width, 3) and seconds (runs,)."""
-
-    pictures: Array
-    wall: Array
-    cpu: Array
-    compile: float
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--spp", type=int, default=64)
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--reference-spp", type=int, default=1024)
-    parser.add_argument("--adapter", nargs="*", default=ADAPTERS, help="shipped names or weights files")
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    parser.add_argument("--output", type=Path, default=Path("out/bench"))
-    options = parser.parse_args()
-    nma.render.use(options.variant)
-    size = (options.size, options.size)
+    arguments = parse()
+    head = frames.begin(arguments.variant)
+    size = (arguments.size, arguments.size)
     coverage = material_coverage(size)
-    print(header())
     print(
-        f"frames   {options.size} x {options.size}, {options.spp} spp, path depth {DEPTH}, material on {coverage:.0%} "
-        f"of the pixels, {options.variant}; {options.runs} runs, reference {options.reference_spp} spp\n\n{COLUMNS}"
+        f"frames   {arguments.size} x {arguments.size}, {arguments.spp} spp, path depth {scenes.DEPTH}, material on "
+        f"{coverage:.0%} of the pixels, {arguments.variant}; {arguments.runs} runs, reference "
+        f"{arguments.reference_spp} spp\n\n{COLUMNS}"
     )
     rows = []
-    for scene, bsdfs in scenes(options.adapter).items():
-        compilation = {name: compile_seconds(bsdf, size, options.spp) for name, bsdf in bsdfs.items()}
-        loaded = {
-            name: load_dict(preview_scene(bsdf, size=size, max_depth=DEPTH)) for name, bsdf in bsdfs.items()
-        }
-        frames = measure_in_turns(loaded, options.spp, options.runs, compilation)
-        halves = [
-            render_passes(loaded["layered"], options.reference_spp // 2, seed=seed).astype(np.float64)
-            for seed in (12345, 54321)
-        ]
+    for scene, bsdfs in subjects(arguments.adapter).items():
+        described = {name: scenes.preview(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs.items()}
+        compilation = {name: compile_seconds(one, arguments.spp) for name, one in described.items()}
+        measured = frames.in_turns(described, arguments.spp, range(arguments.runs))
+        halves = converged_halves(described["layered"], arguments.reference_spp)
         for name in bsdfs:
-            rows.append(row(scene, name, frames, halves))
+            rows.append(row(scene, name, measured, halves) | {"compile": compilation[name]})
             print(line(rows[-1]), flush=True)
     print("\nload     {:.2f} {:.2f} {:.2f} at the end".format(*os.getloadavg()))
-    options.output.mkdir(parents=True, exist_ok=True)
-    record = {
-        "machine": header(),
-        "settings": {k: v for k, v in vars(options).items() if k != "output"},
-        "coverage": coverage,
-        "rows": rows,
-    }
-    (options.output / "render.json").write_text(json.dumps(record, indent=1))
-    plot(rows, options.output / "render.png")
-    print(f"wrote    {options.output}/render.json, {options.output}/render.png")
+    frames.write(arguments.output / "render.json", head, arguments, coverage=coverage, rows=rows)
+    plot(rows, arguments.output / "render.png")
 
 
-def scenes(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
+def parse() -> argparse.Namespace:
+    parser = frames.parser(__doc__, size=256, spp=64, runs=5)
+    parser.add_argument("--reference-spp", type=int, default=1024)
+    parser.add_argument("--adapter", nargs="*", default=ADAPTERS, help="shipped names or weights files")
+    parser.add_argument("--variant", default=frames.VECTORISED)
+    return frames.parse(parser, size=32, spp=8, runs=2, reference_spp=32, adapter=ADAPTERS[-1:])
+
+
+def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
     """For each scene, the BSDFs by name; `layered` and `nma` show the same material, `principled` costs the like."""
     for name in adapters:
         if name not in shipped() and not Path(name).is_file():
             raise SystemExit(f"there is no adapter {name}; shipped are {', '.join(shipped())}")
-    gold = materials.load("gold-red-lacquer")
-    worn = materials.load("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
-    images = {name: bitmap_texture(t, scale=2.0) for name, t in procedural_textures(512).items()}
+    gold = scenes.Subject(materials.load("gold-red-lacquer"))
+    worn = scenes.worn_silver()._replace(repeats=2.0)
     red = {"type": "rgb", "value": [0.8, 0.2, 0.1]}
-    plain: dict[str, Any] = {"type": "principled", "metallic": 0.5, "roughness": 0.35, "clearcoat": 0.5}
-    names = {"base_color": "albedo", "roughness": "alpha_bottom", "metallic": "sigma_t"}
-    textured = plain | {theirs: images[ours] for theirs, ours in names.items()}
     return {
         "plain": {
-            "principled": plain | {"base_color": red},
-            "layered": material_bsdf(gold, "layered"),
-            "nma": material_bsdf(gold, adapter=adapters[0]),
+            "principled": scenes.stand_in(gold) | {"metallic": 0.5, "roughness": 0.35, "base_color": red},
+            "layered": scenes.simulation(gold),
+            "nma": scenes.adapter(gold, adapters[0]),
         },
         "textured": {
-            "principled": textured,
-            "layered": material_bsdf(worn, "layered") | images,
-            **{f"nma {Path(name).stem}": material_bsdf(worn, adapter=name) | images for name in adapters},
+            "principled": scenes.stand_in(worn),
+            "layered": scenes.simulation(worn),
+            **{f"nma {Path(name).stem}": scenes.adapter(worn, name) for name in adapters},
         },
     }
 
 
-def measure_in_turns(
-    loaded: dict[str, Any], spp: int, runs: int, compilation: dict[str, float]
-) -> dict[str, Frames]:
-    """One frame of each, again and again with other seeds, after one that compiles anew for all in memory."""
-    for scene in loaded.values():
-        render_seconds(scene, spp, runs)
-    pictures: dict[str, list[Array]] = {name: [] for name in loaded}
-    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in loaded}
-    for seed in range(runs):
-        for name, scene in loaded.items():
-            before = processor_seconds()
-            picture, wall = render_seconds(scene, spp, seed)
-            seconds[name].append((wall, processor_seconds() - before))
-            pictures[name].append(picture)
-    clocks = {name: np.array(s).T for name, s in seconds.items()}
-    return {
-        name: Frames(np.array(pictures[name]), wall, cpu, compilation[name])
-        for name, (wall, cpu) in clocks.items()
-    }
-
-
-def compile_seconds(bsdf: dict[str, Any], size: tuple[int, int], spp: int) -> float:
+def compile_seconds(description: dict[str, Any], spp: int) -> float:
     """What a first frame takes longer than a second one, without the other BSDFs: Mitsuba compiles all in memory."""
     gc.collect()
-    scene = load_dict(preview_scene(bsdf, size=size, max_depth=DEPTH))
-    first, second = (render_seconds(scene, spp, seed)[1] for seed in range(2))
+    scene = load_dict(description)
+    first, second = (frames.timed(scene, spp, seed)[1] for seed in range(2))
     return max(first - second, 0.0)
 
 
-def processor_seconds() -> float:
-    """Of all threads of this process."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
+def converged_halves(description: dict[str, Any], spp: int) -> list[Array]:
+    """Two independent pictures."""
+    scene = load_dict(description)
+    return [render_passes(scene, spp // 2, seed=seed).astype(np.float64) for seed in (12345, 54321)]
 
 
-def row(scene: str, name: str, frames: dict[str, Frames], halves: list[Array]) -> dict[str, Any]:
+def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array]) -> dict[str, Any]:
     """The figures of one BSDF; `halves` are two independent converged pictures of `layered`."""
-    own, principled = frames[name], frames["principled"]
-    variance, wall = float(own.pictures.var(axis=0, ddof=1).mean()), float(np.median(own.wall))
+    own, principled = measured[name], measured["principled"]
+    variance, wall = own.variance, own.seconds
     figures: dict[str, Any] = {
         "scene": scene,
         "bsdf": name,
@@ -183,7 +125,6 @@ def row(scene: str, name: str, frames: dict[str, Frames], halves: list[Array]) -
         "seconds_ratio": float(np.median(own.wall / principled.wall)),
         "cpu": float(np.median(own.cpu)),
         "cpu_ratio": float(np.median(own.cpu / principled.cpu)),
-        "compile": own.compile,
         "variance": variance,
         "efficiency": 1.0 / (variance * wall),
         "all_seconds": own.wall.tolist(),
@@ -229,9 +170,8 @@ def line(row: dict[str, Any]) -> str:
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Root mean square error against rendering time, one panel for each scene."""
     names = list(dict.fromkeys(row["scene"] for row in rows))
-    figure, panels = plt.subplots(
-        1, len(names), figsize=(5.0 * len(names), 3.8), sharey=True, layout="constrained"
-    )
+    figure = Figure(figsize=(5.0 * len(names), 3.8), layout="constrained")
+    panels = figure.subplots(1, len(names), sharey=True)
     for panel, scene in zip(panels, names, strict=True):
         for row in rows:
             if row["scene"] != scene or "squared_bias" not in row:
@@ -245,7 +185,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         panel.grid(alpha=0.3)
         panel.legend()
     panels[0].set_ylabel("expected RMS error of the picture")
-    figure.savefig(path, dpi=120)
+    frames.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ import scenes
 from matplotlib.figure import Figure
 
 import nma
-from nma.render.load import load_dict
 
 SCENE = "environment"
 # Means of the paper's Table 4.
@@ -66,23 +65,22 @@ def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
     """What is compared, by name."""
     found = {scenes.SIMULATION: scenes.simulation(subject)}
     for name in nma.shipped():
-        made = scenes.adapter(subject, name)
-        found[f"{scenes.short(name)} online"] = scenes.online(made)
-        found[f"{scenes.short(name)} curves"] = made
-    found["5x64 online, bfloat16"] = scenes.online(scenes.adapter(subject, "layered3-5x64"), "bfloat16")
+        found[f"{scenes.short(name)} online"] = scenes.network(subject, name)
+        found[f"{scenes.short(name)} curves"] = scenes.adapter(subject, name)
+    found["5x64 online, bfloat16"] = scenes.network(subject, "layered3-5x64", "bfloat16")
     return found | {scenes.STAND_IN: scenes.stand_in(subject), scenes.NOTHING: scenes.DIFFUSE}
 
 
 def compare(subject: scenes.Subject, number: int, arguments: argparse.Namespace) -> Figures:
     """Seconds, variance and, for the first materials, squared error of every BSDF."""
     size, scene = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
-    loaded = {name: load_dict(scene(bsdf, size, arguments.rr_depth)) for name, bsdf in bsdfs(subject).items()}
+    described = {name: scene(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs(subject).items()}
     # Other materials get other samples, or their noise would be alike.
     seeds = range(number * arguments.runs, (number + 1) * arguments.runs)
-    measured = frames.in_turns(loaded, arguments.spp, seeds)
+    measured = frames.in_turns(described, arguments.spp, seeds)
     reference = None
     if number < arguments.error:
-        reference = frames.converged(loaded[scenes.SIMULATION], arguments.reference_spp)
+        reference = frames.converged(described[scenes.SIMULATION], arguments.reference_spp)
     return {
         name: frames.figures(of_one, None if name in OTHER_MATERIALS else reference)
         for name, of_one in measured.items()

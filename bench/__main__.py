@@ -1,0 +1,67 @@
+"""Lists the benches, or runs them one after the other.
+
+python bench                                         what there is
+python bench all [--quick] [--output FOLDER]         run all of them
+python bench NAME ... [--quick] [--output FOLDER]    run some
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+# What only prints, and how it is quick.
+PRINTING = {"training": ["--steps", "60"], "walks": ["--walks", "81920", "--repeat", "1"]}
+
+
+def benches() -> dict[str, Path]:
+    """Name and script of every bench: the files here that can be run."""
+    scripts = sorted(HERE.glob("*.py"))
+    return {s.stem: s for s in scripts if s != Path(__file__) and "__main__" in s.read_text()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--quick", action="store_true", help="small and few, to see that they run")
+    parser.add_argument("--output", type=Path, help="folder of the results")
+    arguments = parser.parse_args()
+    known = benches()
+    if not arguments.names:
+        for name, script in known.items():
+            print(f"{name:10} {(ast.get_docstring(ast.parse(script.read_text())) or '').splitlines()[0]}")
+        return
+    unknown = set(arguments.names) - {"all", *known}
+    if unknown:
+        sys.exit(f"no bench {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    if arguments.output:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    for name in known if "all" in arguments.names else arguments.names:
+        # The command stands in the results: no path of this machine.
+        command = [
+            sys.executable,
+            os.path.relpath(known[name]),
+            *words(name, arguments.quick, arguments.output),
+        ]
+        print(f"== {name}: {' '.join(command[1:])}", flush=True)
+        subprocess.run(command, check=True)
+
+
+def words(name: str, quick: bool, output: Path | None) -> list[str]:
+    """The options of a bench."""
+    if name in PRINTING:
+        return PRINTING[name] if quick else []
+    if name == "runtime":
+        return ["--json", str(output / "runtime.json")] if output else []
+    return (["--quick"] if quick else []) + (["--output", str(output)] if output else [])
+
+
+if __name__ == "__main__":
+    main()

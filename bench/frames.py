@@ -1,0 +1,312 @@
+"""How the benches of whole frames measure: in turns, with independent seeds, against converged pictures.
+
+Two figures tell how good a frame is. Its variance, mean over pixels and channels, from independent seeds: noise alone.
+Its squared error, the mean squared difference from a converged picture of `layered`: for an adapter noise and bias. The
+converged picture's own noise, known from its independent parts, is subtracted, so that `layered`'s error is its
+variance. An efficiency is 1 / (variance x seconds) or 1 / (error x seconds).
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import math
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from machine import header
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scenes import RR_DEPTH, digest
+
+import nma.render
+from nma.cli.console import progress
+from nma.render.load import load_dict
+from nma.render.measure import render_seconds
+from nma.render.progressive import render_passes
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "figures"))
+import common  # noqa: E402
+
+Array = NDArray[np.float64]
+Row = Mapping[str, Any]  # figures by name; None where one is not known
+SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
+OUTPUT = Path("out/bench")
+REFERENCES = ROOT / "out/bench/references"
+# Of a frame in one piece, which bounds memory.
+MOST_SAMPLES = 1 << 23
+# Parts of a converged picture; their spread tells its noise.
+PARTS = 4
+# Seeds of converged pictures lie beyond those of frames.
+REFERENCE_SEED = 1_000_000
+EVEN = 1.1  # efficiencies closer than this factor are called even
+
+
+class Frames(NamedTuple):
+    """Several frames of one scene: pictures (runs, height, width, 3), their seconds and processor seconds (runs,)."""
+
+    pictures: Array
+    wall: Array
+    cpu: Array
+
+    @property
+    def seconds(self) -> float:
+        return float(np.median(self.wall))
+
+    @property
+    def variance(self) -> float:
+        return float(self.pictures.var(axis=0, ddof=1).mean())
+
+
+class Converged(NamedTuple):
+    """A picture (height, width, 3) of many samples, and the mean square of the noise that is left in it."""
+
+    picture: Array
+    noise: float
+
+
+def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[int]) -> dict[str, Frames]:
+    """Frames of all the scenes, given as dictionaries: one of each for every seed, so that other load on the machine
+    meets all."""
+    turn = _turns(scenes, spp)
+    found: dict[str, list[tuple[Array, float, float]]] = {name: [] for name in scenes}
+    for seed in seeds:
+        for name in scenes:
+            found[name].append(turn(name, seed))
+    return {name: Frames(*map(np.asarray, zip(*rows, strict=True))) for name, rows in found.items()}
+
+
+def _turns(
+    scenes: Mapping[str, Mapping[str, Any]], spp: int
+) -> Callable[[str, int], tuple[Array, float, float]]:
+    """What renders a scene by its name with a seed."""
+    import mitsuba as mi
+
+    if mi.variant() == SCALAR:
+        loaded = {name: load_dict(description) for name, description in scenes.items()}
+        return lambda name, seed: timed(loaded[name], spp, seed)
+
+    def alone(name: str, seed: int) -> tuple[Array, float, float]:
+        # Vectorised, every frame traces all BSDFs in memory, so there is to be one scene's alone. The first frame
+        # compiles, or finds its kernel from the last turn.
+        gc.collect()
+        scene = load_dict(scenes[name])
+        timed(scene, spp, seed)
+        return timed(scene, spp, seed)
+
+    return alone
+
+
+def timed(scene: Any, spp: int, seed: int) -> tuple[Array, float, float]:
+    """A frame of a loaded scene, its wall time and the processor seconds of all threads."""
+    width, height = scene.sensors()[0].film().crop_size()
+    before, began = processor_seconds(), time.perf_counter()
+    if spp * int(width) * int(height) <= MOST_SAMPLES:
+        picture, _ = render_seconds(scene, spp, seed)
+    else:
+        picture = render_passes(scene, spp, seed=seed).astype(np.float64)
+    return picture, time.perf_counter() - began, processor_seconds() - before
+
+
+def processor_seconds() -> float:
+    """Of all threads of this process."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def converged(
+    description: Mapping[str, Any],
+    spp: int,
+    keep: Path | None = None,
+    parts: int = PARTS,
+    advance: Callable[[], object] = lambda: None,
+) -> Converged:
+    """A picture of `spp` samples in independent parts.
+
+    Args:
+        keep: how the parts' files begin; those that are there already are not rendered again.
+        advance: called after each part.
+    """
+    pictures, scene = [], None
+    for number in range(parts):
+        path = keep and keep.with_name(f"{keep.name}_{spp // parts}-spp_{number}.npy")
+        if path and path.exists():
+            picture = np.load(path)
+        else:
+            scene = scene or load_dict(description)
+            picture = render_passes(scene, spp // parts, seed=REFERENCE_SEED + number)
+            if path:
+                common.save_array(path, picture)
+        pictures.append(picture.astype(np.float64))
+        advance()
+    return Converged(np.mean(pictures, axis=0), float(np.var(pictures, axis=0, ddof=1).mean()) / parts)
+
+
+def kept_as(scene: str, arguments: argparse.Namespace) -> Path:
+    """Where the parts of a converged picture stay."""
+    settings = f"{arguments.size}px_rr-{arguments.rr_depth}_{arguments.variant}"
+    return REFERENCES / f"{scene}-{digest()}_{settings}"
+
+
+def squared_errors(pictures: Array, reference: Converged) -> Array:
+    """Of each frame (runs,), mean over pixels and channels."""
+    return ((pictures - reference.picture) ** 2).mean(axis=(1, 2, 3)) - reference.noise
+
+
+def figures(frames: Frames, reference: Converged | None = None) -> dict[str, float | None]:
+    """Seconds, variance and, given a converged picture of the same material, squared error and its doubt: the error's
+    standard error over the runs, as a share of it."""
+    found: dict[str, float | None] = {"seconds": frames.seconds, "variance": frames.variance}
+    if reference is None:
+        return found | {"error": None, "doubt": None}
+    errors = squared_errors(frames.pictures, reference)
+    doubt = errors.std(ddof=1) / math.sqrt(len(errors)) / abs(errors.mean())
+    return found | {"error": float(errors.mean()), "doubt": float(doubt)}
+
+
+def ratios(own: Row, simulation: Row) -> dict[str, Any]:
+    """Time, variance, error and efficiencies to those of the simulation; None without an error."""
+    time, variance, error = (ratio(own[key], simulation[key]) for key in ("seconds", "variance", "error"))
+    return {
+        "time": time,
+        "variance": variance,
+        "error": error,
+        "efficiency by variance": ratio(1.0, time and variance and time * variance),
+        "efficiency by error": ratio(1.0, time and error and time * error),
+    }
+
+
+def ratio(a: float | None, b: float | None) -> float | None:
+    """a / b, or None where one is not known, or where a difference of two noisy numbers has come out negative."""
+    return a / b if a and b and a > 0.0 and b > 0.0 else None
+
+
+def geometric_mean(values: Iterable[float | None]) -> float | None:
+    """Of those that are known."""
+    logs = [math.log(value) for value in values if value is not None]
+    return math.exp(sum(logs) / len(logs)) if logs else None
+
+
+def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str, dict[str, Any]]:
+    """Geometric means over materials of the ratios to the simulation, by BSDF."""
+    each = [{name: ratios(row[name], row[simulation]) for name in row} for row in rows]
+    return {
+        name: {key: geometric_mean(row[name][key] for row in each) for key in each[0][name]}
+        for name in each[0]
+    }
+
+
+def mean_doubt(rows: Sequence[Mapping[str, Row]], name: str, simulation: str) -> float | None:
+    """Standard error of the mean ratio of errors, as a share of it; None where there is no error."""
+    doubts = [row[bsdf]["doubt"] for row in rows for bsdf in (name, simulation)]
+    return None if None in doubts else math.hypot(*doubts) / len(rows)
+
+
+def verdict(efficiency: float | None) -> str:
+    """What to render with, from an adapter's efficiency by error relative to the simulation's."""
+    if efficiency is None:
+        return "-"
+    if 1.0 / EVEN <= efficiency <= EVEN:
+        return "even"
+    return "adapter" if efficiency > 1.0 else "simulation"
+
+
+def markdown(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table of aligned columns: text to the left, numbers to the right."""
+    cells = [list(headings), *([_cell(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    text = [all(row[n] == "-" or not _is_number(row[n]) for row in cells[1:]) for n in range(len(headings))]
+    lines = [
+        "| "
+        + " | ".join(c.ljust(w) if t else c.rjust(w) for c, w, t in zip(row, widths, text, strict=True))
+        + " |"
+        for row in cells
+    ]
+    rule = "|" + "|".join(
+        "-" * (w + 2) if t else "-" * (w + 1) + ":" for w, t in zip(widths, text, strict=True)
+    )
+    return "\n".join([lines[0], rule + "|", *lines[1:]])
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.2e}" if 0.0 < abs(value) < 0.1 else f"{value:.3g}" if value >= 100.0 else f"{value:.2f}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def parser(doc: str | None, size: int, spp: int, runs: int) -> argparse.ArgumentParser:
+    """A command line described by the script's docstring, with what every bench of frames takes."""
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--size", type=int, default=size, help="height of the pictures, in pixels")
+    made.add_argument("--spp", type=int, default=spp, help="samples per pixel of a frame")
+    made.add_argument("--runs", type=int, default=runs, help="frames of each, with seeds of their own")
+    made.add_argument("--rr-depth", type=int, default=RR_DEPTH, help="where Russian roulette begins")
+    made.add_argument("--quick", action="store_true", help="small and few, to see that it runs")
+    made.add_argument("--output", type=Path, help=f"folder of the results, else {OUTPUT} or {OUTPUT}/quick")
+    return made
+
+
+def parse(made: argparse.ArgumentParser, **quick: Any) -> argparse.Namespace:
+    """The arguments; with --quick, `quick` replaces some of them."""
+    arguments = made.parse_args()
+    if arguments.quick:
+        vars(arguments).update(quick)
+    if arguments.runs < 2:
+        made.error("--runs: a variance needs 2 or more")
+    arguments.output = arguments.output or (OUTPUT / "quick" if arguments.quick else OUTPUT)
+    return arguments
+
+
+def settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {key: value for key, value in vars(arguments).items() if key != "output"}
+
+
+def write(path: Path, head: str, arguments: argparse.Namespace, **data: Any) -> None:
+    """Results as JSON, after the machine (its `header` at the start) and the settings."""
+    common.write_json(path, {"machine": head.splitlines(), "settings": settings(arguments)} | data)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    print(path)
+
+
+def begin(variant: str | None = None) -> str:
+    """Prints the machine's header and returns it; chooses Mitsuba's variant."""
+    head = header()
+    print(head, flush=True)
+    if variant:
+        nma.render.use(variant)
+    return head
+
+
+@contextmanager
+def bar(what: str, unit: str, total: int) -> Iterator[Callable[[], None]]:
+    """A progress bar; what it yields is called after each of `total` steps."""
+    with progress(f"{unit}/min") as shown:
+        task = shown.add_task(what, total=total, rate="", note="")
+
+        def advance() -> None:
+            shown.update(task, advance=1)
+            speed = shown.tasks[task].speed
+            shown.update(task, rate=f"{60 * speed:.1f}" if speed else "")
+
+        yield advance

@@ -1,0 +1,224 @@
+"""What the benches of whole frames render: scenes, materials, and a material as each BSDF that is compared."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import nma
+import nma.render.scene
+import nma.render.textures
+from nma.materials import Material
+from nma.render.load import material_bsdf
+from nma.render.scene import LAMP_RADIANCE, Camera, bitmap_texture, preview_scene
+from nma.render.shaderball import shader_ball_file
+from nma.render.textures import periodic_noise, procedural_textures
+
+DEPTH, RR_DEPTH = 6, 5  # longest path, and Mitsuba's default for where Russian roulette begins
+SIMULATION, STAND_IN, NOTHING = "layered", "principled", "diffuse"
+# All but the material: its frame is the time that no BSDF can go below.
+DIFFUSE = {"type": "diffuse"}
+TEXELS = 512
+# Small and bright, out of the camera's sight: direction from the ball's middle, distance, and the light's colour.
+LIGHTS = (
+    ((-1.00, -0.70, 0.85), 2.4, (1.00, 0.85, 0.65)),
+    ((0.80, -0.50, 0.55), 2.2, (0.70, 0.85, 1.00)),
+    ((0.10, -0.45, 1.00), 2.0, (1.00, 0.97, 0.92)),
+    ((-0.75, 0.45, 1.00), 2.6, (1.00, 0.60, 0.45)),
+    ((0.70, 0.60, 0.95), 3.2, (0.60, 0.75, 1.00)),
+    ((0.25, -1.00, 0.75), 4.0, (1.00, 0.92, 0.80)),
+)
+LIGHTS_AROUND = (0.0, 0.0, 1.1)
+LIGHT_RADIUS, LIGHT_POWER = 0.06, 90.0  # radiance at distance 1; it grows with the distance squared
+WIDE = Camera((0.0, -8.6, 3.0), (0.0, 0.0, 1.0), 18.2)
+TEASER_ASPECT = 20 / 9
+SOFT_BOX_PLACE, SOFT_BOX_SIZE, SOFT_BOX_RADIANCE = (-3.4, -3.6, 4.6), (1.6, 1.0, 1.0), 0.18
+Bsdf = Mapping[str, Any]
+
+
+class Subject(NamedTuple):
+    """A source material, textures (height, width[, 3]) for some of its parameters, and how often they repeat."""
+
+    material: Material
+    textures: Mapping[str, NDArray[np.floating]] = {}
+    repeats: float = 2.0
+
+    def images(self) -> dict[str, Any]:
+        """The textures as Mitsuba's; made anew for the variant in use."""
+        return {name: bitmap_texture(values, scale=self.repeats) for name, values in self.textures.items()}
+
+
+def simulation(subject: Subject) -> dict[str, Any]:
+    return material_bsdf(subject.material, "layered") | subject.images()
+
+
+def adapter(subject: Subject, name: str, clamp: bool = False) -> dict[str, Any]:
+    """By a shipped adapter or a weights file: curves over the angle without textures, with them the network."""
+    return material_bsdf(subject.material, "nma", adapter=name, clamp=clamp) | subject.images()
+
+
+def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
+    """An adapter whose network runs at every shading point.
+
+    The scalar plugin has an option for that; elsewhere a texture asks for it, here one of a single value.
+    """
+    import mitsuba as mi
+
+    if mi.variant() == "scalar_rgb":
+        return dict(bsdf) | {"online": True, "precision": precision}
+    if isinstance(bsdf["sigma_t"], float):
+        return dict(bsdf) | {"sigma_t": bitmap_texture(np.full((2, 2), bsdf["sigma_t"]))}
+    return dict(bsdf)
+
+
+def network(subject: Subject, name: str, precision: str = "compact") -> dict[str, Any]:
+    """By an adapter whose network runs at every shading point."""
+    return online(adapter(subject, name), precision)
+
+
+def stand_in(subject: Subject) -> dict[str, Any]:
+    """Mitsuba's `principled`, textured alike: another material, for its time and noise."""
+    names = {"albedo": "base_color", "alpha_bottom": "roughness", "sigma_t": "metallic"}
+    images = {names[name]: image for name, image in subject.images().items()}
+    return {"type": "principled", "metallic": 0.7, "roughness": 0.3, "clearcoat": 0.5} | images
+
+
+def short(name: str) -> str:
+    """layered3-5x64 -> 5x64."""
+    return name.split("-")[-1]
+
+
+def unseen(count: int, seed: int = 92) -> list[Subject]:
+    """Materials of the paper's ranges that no adapter was trained on."""
+    params = nma.LAYERED3.sample(np.random.default_rng(seed), count, "range")
+    return [Subject(Material.of_vector(f"unseen-{n}", row, nma.LAYERED3)) for n, row in enumerate(params)]
+
+
+def worn_silver() -> Subject:
+    """Silver under worn lacquer, marbled: its roughness, the pigment and its amount come from textures."""
+    silver = nma.load_material("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
+    return Subject(silver, procedural_textures(TEXELS), repeats=1.0)
+
+
+def patinated_copper() -> Subject:
+    """Copper under a verdigris of uneven tone that crumbles where it is thin."""
+    rng = np.random.default_rng(3)
+    large, fine = (
+        periodic_noise(rng, TEXELS, period=period, slope=slope) for period, slope in ((0.3, 2.0), (0.06, 1.3))
+    )
+    cover = 1.0 / (1.0 + np.exp(-4.0 * (large + 0.45 * fine + 0.35)))
+    tone = 1.0 / (1.0 + np.exp(-1.2 * (fine - 0.4 * large)))[..., None]
+    greens = np.array([0.20, 0.66, 0.58]) * (1.0 - tone) + np.array([0.84, 0.98, 0.92]) * tone
+    copper = nma.load_material("verdigris-bronze").changed({"alpha_top": 0.15})
+    textures = {"albedo": greens, "sigma_t": cover, "alpha_bottom": 0.12 + 0.4 * cover}
+    return Subject(copper, {name: values.astype(np.float32) for name, values in textures.items()})
+
+
+def scratched_gold() -> Subject:
+    """Gold with finger prints and scratches below a smooth red lacquer that is thick in some places."""
+    textures = procedural_textures(TEXELS, seed=7)
+    amount = 0.15 + 0.5 * textures["sigma_t"]
+    gold = nma.load_material("gold-red-lacquer")
+    return Subject(gold, {"alpha_bottom": textures["alpha_bottom"], "sigma_t": amount})
+
+
+TEXTURED: dict[str, Callable[[], Subject]] = {
+    "worn silver": worn_silver,
+    "patinated copper": patinated_copper,
+    "scratched gold": scratched_gold,
+}
+
+
+def preview(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
+    """The preview scene: sun, sky and a lamp."""
+    return preview_scene(bsdf, size=size, integrator=_path(rr_depth))
+
+
+def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
+    """The ball in the dark among small, bright lights: their sampling and highlights dominate the noise."""
+    scene = preview(bsdf, size, rr_depth)
+    del scene["sky"], scene["lamp"]
+    return scene | {f"light-{n}": _light(*light) for n, light in enumerate(LIGHTS)}
+
+
+def environment(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
+    """A sphere that fills the picture under the sky alone: the material dominates the time.
+
+    A second BSDF lies out of sight. Where there is one alone, a vectorised renderer inlines it and runs it also for
+    rays that have left the scene, which makes networks 1.8 times slower: other scenes have two or more.
+    """
+    scene = preview_scene(bsdf, size=size, integrator=_path(rr_depth), hide_sun=True)
+    del scene["floor"], scene["lamp"]
+    scene["sensor"]["fov"] = 19.0
+    ball = {"type": "sphere", "center": [0.0, 0.0, 1.0], "radius": 1.0}
+    unseen = {"type": "sphere", "center": [0.0, 0.0, -90.0], "radius": 0.01, "bsdf": DIFFUSE}
+    return scene | {"ball": ball | {"bsdf": {"type": "ref", "id": "material"}}, "unseen": unseen}
+
+
+SCENES: dict[str, Callable[[Bsdf, tuple[int, int], int], dict[str, Any]]] = {
+    "preview": preview,
+    "lights": lights,
+    "environment": environment,
+}
+
+
+def teaser(
+    model: Callable[[Subject], Bsdf], size: tuple[int, int], rr_depth: int = RR_DEPTH
+) -> dict[str, Any]:
+    """Three shader balls, one of each textured material, each as the BSDF that `model` makes of it.
+
+    The light is soft: under a sun a few pixels hold nearly all of the noise, and many runs would be needed to tell
+    BSDFs apart.
+    """
+    import mitsuba as mi
+
+    subjects = [make() for make in TEXTURED.values()]
+    scene = preview_scene(
+        model(subjects[0]), size=size, integrator=_path(rr_depth), camera=WIDE, hide_sun=True
+    )
+    scene["lamp"]["to_world"] = (
+        mi.ScalarTransform4f()
+        .look_at(list(SOFT_BOX_PLACE), [0.0, 0.0, 0.9], [0.0, 0.0, 1.0])
+        .scale(list(SOFT_BOX_SIZE))
+    )
+    radiance = {"type": "rgb", "value": [SOFT_BOX_RADIANCE * value for value in LAMP_RADIANCE]}
+    scene["lamp"]["emitter"] = {"type": "area", "radiance": radiance}
+    places = ((-2.12, 0.3, 10.0), (0.0, -0.1, 0.0), (2.12, 0.3, -16.0))
+    del scene["ball"], scene["material"]
+    for n, (subject, (x, y, turn)) in enumerate(zip(subjects, places, strict=True)):
+        place = mi.ScalarTransform4f().translate([x, y, 0.0]).rotate([0.0, 0.0, 1.0], turn)
+        ball = {"type": "ply", "filename": str(shader_ball_file()), "to_world": place}
+        scene[f"ball-{n}"] = ball | {"bsdf": dict(model(subject))}
+    return scene
+
+
+def teaser_size(height: int) -> tuple[int, int]:
+    """Width and height."""
+    return round(TEASER_ASPECT * height), height
+
+
+def digest() -> str:
+    """Names pictures that are kept: another scene has other ones."""
+    files = [__file__, *(module.__file__ for module in (nma.render.scene, nma.render.textures))]
+    return hashlib.sha256(b"".join(Path(str(file)).read_bytes() for file in files)).hexdigest()[:8]
+
+
+def _path(rr_depth: int) -> dict[str, Any]:
+    return {"type": "path", "max_depth": DEPTH, "rr_depth": rr_depth}
+
+
+def _light(towards: tuple[float, ...], distance: float, colour: tuple[float, ...]) -> dict[str, Any]:
+    """Alike bright on the ball at every distance."""
+    direction = np.array(towards) / np.linalg.norm(towards)
+    radiance = (LIGHT_POWER * distance**2 * np.array(colour)).tolist()
+    return {
+        "type": "sphere",
+        "center": (np.array(LIGHTS_AROUND) + distance * direction).tolist(),
+        "radius": LIGHT_RADIUS,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+    }

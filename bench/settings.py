@@ -1,0 +1,144 @@
+"""Simulation or adapter? Time, variance, error and efficiency by renderer, scene, and with or without textures.
+
+python bench/settings.py [--variant scalar_rgb llvm_ad_rgb] [--scene preview lights environment] [--materials 4]
+    [--size 192] [--spp 64] [--runs 4] [--reference-spp 1024] [--rr-depth 5] [--quick] [--output out/bench]
+
+Untextured materials are unseen ones of the paper's ranges, and adapters curves over the viewing angle; textured ones
+are those of bench/scenes.py, where the network runs at every shading point. Figures are geometric means over the
+materials of ratios to `layered`; what variance, error and efficiency are, bench/frames.py tells. The verdict goes by
+the efficiency by error, "even" within 10 %; `doubt` is its standard error as a share of it, from the runs: a few bright
+pixels hold most of the noise under sun and lamps. `principled` is a stand-in, another material: it has no error.
+
+BSDFs take turns. A vectorised renderer compiles before the clock starts, but traces every frame anew in Python, some
+0.05 s for the larger network: in smaller frames than these adapters look slower there.
+
+Writes settings.json, settings.md (the table) and settings.png (efficiencies by error).
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import frames
+import numpy as np
+import scenes
+from matplotlib.figure import Figure
+
+import nma
+import nma.render
+
+KINDS = ("untextured", "textured")
+
+
+def main() -> None:
+    arguments = parse()
+    head = frames.begin()
+    settings = list(itertools.product(arguments.variant, arguments.scene, KINDS))
+    rows, measured = [], []
+    with frames.bar(
+        "rendering", "materials", sum(len(list(subjects(s[2], arguments))) for s in settings)
+    ) as advance:
+        for variant, scene, kind in settings:
+            nma.render.use(variant)
+            of_setting = []
+            for seed, subject in enumerate(subjects(kind, arguments)):
+                of_setting.append(compare(subject, scene, seed, arguments))
+                advance()
+            place = {"renderer": variant, "scene": scene, "material": kind}
+            rows += summary(place, of_setting)
+            measured.append(place | {"materials": of_setting})
+    columns = list(rows[0])
+    text = frames.markdown(columns, [list(row.values()) for row in rows])
+    print(text)
+    frames.write(arguments.output / "settings.json", head, arguments, rows=rows, measured=measured)
+    frames.common.write_text(arguments.output / "settings.md", text + "\n")
+    plot(rows, arguments.output / "settings.png")
+
+
+def parse() -> argparse.Namespace:
+    parser = frames.parser(__doc__, size=192, spp=64, runs=4)
+    parser.add_argument("--variant", nargs="+", default=[frames.SCALAR, frames.VECTORISED])
+    parser.add_argument("--scene", nargs="+", choices=scenes.SCENES, default=list(scenes.SCENES))
+    parser.add_argument("--materials", type=int, default=4, help="untextured ones")
+    parser.add_argument("--textured", type=int, default=len(scenes.TEXTURED), help="textured ones")
+    parser.add_argument("--reference-spp", type=int, default=1024, help="samples of the converged pictures")
+    return frames.parse(parser, size=32, spp=8, runs=2, materials=1, textured=1, reference_spp=64)
+
+
+def subjects(kind: str, arguments: argparse.Namespace) -> Iterator[scenes.Subject]:
+    """The materials of one kind, made one after the other."""
+    if kind == "untextured":
+        yield from scenes.unseen(arguments.materials)
+    else:
+        yield from (make() for make in list(scenes.TEXTURED.values())[: arguments.textured])
+
+
+def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
+    """What is compared, by name."""
+    found = {scenes.SIMULATION: scenes.simulation(subject)}
+    for name in reversed(nma.shipped()):
+        make = scenes.network if subject.textures else scenes.adapter
+        found[scenes.short(name)] = make(subject, name)
+    return found | {scenes.STAND_IN: scenes.stand_in(subject)}
+
+
+def compare(
+    subject: scenes.Subject, scene: str, number: int, arguments: argparse.Namespace
+) -> dict[str, dict[str, float | None]]:
+    """Seconds, variance and squared error of every BSDF."""
+    size, make = (arguments.size, arguments.size), scenes.SCENES[scene]
+    described = {name: make(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs(subject).items()}
+    seeds = range(number * arguments.runs + 1, (number + 1) * arguments.runs + 1)
+    measured = frames.in_turns(described, arguments.spp, seeds)
+    reference = frames.converged(described[scenes.SIMULATION], arguments.reference_spp)
+    return {
+        name: frames.figures(of_one, None if name == scenes.STAND_IN else reference)
+        for name, of_one in measured.items()
+    }
+
+
+def summary(
+    place: dict[str, str], measured: list[dict[str, dict[str, float | None]]]
+) -> list[dict[str, Any]]:
+    """Rows of the table for one setting, one for each BSDF but the simulation."""
+    means = frames.mean_ratios(measured, scenes.SIMULATION)
+    rows = []
+    for name, figures in means.items():
+        if name != scenes.SIMULATION:
+            doubt = frames.mean_doubt(measured, name, scenes.SIMULATION)
+            verdict = frames.verdict(figures["efficiency by error"])
+            rows.append(place | {"BSDF": name} | figures | {"doubt": doubt, "verdict": verdict})
+    return rows
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Bars of every adapter's efficiency by error in every setting, one panel for each renderer."""
+    renderers = list(dict.fromkeys(row["renderer"] for row in rows))
+    names = [name for name in dict.fromkeys(row["BSDF"] for row in rows) if name != scenes.STAND_IN]
+    figure = Figure(figsize=(9.5, 0.6 + 3.0 * len(renderers)), layout="constrained")
+    for axes, renderer in zip(np.atleast_1d(figure.subplots(len(renderers), 1)), renderers, strict=True):
+        own = [row for row in rows if row["renderer"] == renderer]
+        places = list(dict.fromkeys((row["scene"], row["material"]) for row in own))
+        for n, name in enumerate(names):
+            gains = [row["efficiency by error"] or np.nan for row in own if row["BSDF"] == name]
+            width = 0.8 / len(names)
+            middles = np.arange(len(places)) + (n - 0.5 * (len(names) - 1)) * width
+            # Bars begin at 1, where simulation and adapter are even.
+            bars = axes.bar(middles, np.array(gains) - 1.0, width, bottom=1.0, label=name)
+            axes.bar_label(bars, [f"{gain:.2f}" for gain in gains], fontsize="small", padding=1)
+        axes.axhline(1.0, color="k", linewidth=0.8)
+        axes.set_yscale("log")
+        axes.margins(y=0.15)
+        axes.set_xticks(range(len(places)), ["\n".join(place) for place in places])
+        axes.set(title=renderer, ylabel="efficiency over layered")
+        axes.grid(axis="y", alpha=0.3)
+    figure.axes[0].legend()
+    frames.save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    main()
