@@ -360,7 +360,8 @@ def test_only_directional_adapters_depend_on_the_direction(form, name):
     varies = np.ptp(curves, axis=1).max() > 1e-3
     assert varies == adapter.directional
     if not adapter.directional:
-        assert np.ptp(curves, axis=1).max() == 0.0
+        # Rounding alone: a product of matrices may sum the last rows in another order than the first.
+        assert np.ptp(curves, axis=1).max() < 1e-6
     assert (np.ptp(curves, axis=0).max() > 1e-3) == (name != "direction")
 
 
