@@ -1,6 +1,6 @@
 """Table 4 of the paper: unseen materials in Mitsuba's scalar renderer, simulation against adapters, at equal samples.
 
-python bench/scalar.py [--scene preview|lights|environment] [--materials 92] [--size 96] [--spp 32] [--runs 3]
+python bench/scalar.py [--scene sphere|environment|preview|lights] [--materials 92] [--size 96] [--spp 32] [--runs 3]
     [--error 8] [--reference-spp 2048] [--rr-depth 5] [--quick] [--output out/bench]
 
 BSDFs take turns within a material, so that other load on the machine meets all of them; a frame's time is the median of
@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 import nma
 
-SCENE = "environment"
+SCENE = "sphere"
 # Means of the paper's Table 4.
 PAPER_TIME, PAPER_EFFICIENCY = 0.58, 1.67
 OTHER_MATERIALS = (scenes.STAND_IN, scenes.NOTHING)

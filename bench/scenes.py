@@ -146,24 +146,27 @@ def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[
     return scene | {f"light-{n}": _light(*light) for n, light in enumerate(LIGHTS)}
 
 
-def environment(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
-    """A sphere that fills the picture under the sky alone: the material dominates the time.
-
-    A second BSDF lies out of sight. Where there is one alone, a vectorised renderer inlines it and runs it also for
-    rays that have left the scene, which makes networks 1.8 times slower: other scenes have two or more.
-    """
-    scene = preview_scene(bsdf, size=size, integrator=_path(rr_depth), hide_sun=True)
+def sphere(
+    bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH, hide_sun: bool = False
+) -> dict[str, Any]:
+    """A sphere that fills the picture under sun and sky, one environment map: the material dominates the time."""
+    scene = preview_scene(bsdf, size=size, integrator=_path(rr_depth), hide_sun=hide_sun)
     del scene["floor"], scene["lamp"]
     scene["sensor"]["fov"] = 19.0
     ball = {"type": "sphere", "center": [0.0, 0.0, 1.0], "radius": 1.0}
-    unseen = {"type": "sphere", "center": [0.0, 0.0, -90.0], "radius": 0.01, "bsdf": DIFFUSE}
-    return scene | {"ball": ball | {"bsdf": {"type": "ref", "id": "material"}}, "unseen": unseen}
+    return scene | {"ball": ball | {"bsdf": {"type": "ref", "id": "material"}}}
+
+
+def environment(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
+    """The same sphere under the sky alone, which has no bright spot."""
+    return sphere(bsdf, size, rr_depth, hide_sun=True)
 
 
 SCENES: dict[str, Callable[[Bsdf, tuple[int, int], int], dict[str, Any]]] = {
     "preview": preview,
     "lights": lights,
     "environment": environment,
+    "sphere": sphere,
 }
 
 

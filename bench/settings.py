@@ -32,6 +32,7 @@ import nma
 import nma.render
 
 KINDS = ("untextured", "textured")
+SCENES = ("preview", "lights", "environment")
 
 
 def main() -> None:
@@ -62,7 +63,7 @@ def main() -> None:
 def parse() -> argparse.Namespace:
     parser = frames.parser(__doc__, size=192, spp=64, runs=4)
     parser.add_argument("--variant", nargs="+", default=[frames.SCALAR, frames.VECTORISED])
-    parser.add_argument("--scene", nargs="+", choices=scenes.SCENES, default=list(scenes.SCENES))
+    parser.add_argument("--scene", nargs="+", choices=scenes.SCENES, default=SCENES)
     parser.add_argument("--materials", type=int, default=4, help="untextured ones")
     parser.add_argument("--textured", type=int, default=len(scenes.TEXTURED), help="textured ones")
     parser.add_argument("--reference-spp", type=int, default=1024, help="samples of the converged pictures")

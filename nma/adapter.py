@@ -140,11 +140,14 @@ class Adapter:
     def _bounded(self, blend: Blend, cos_theta_i: Float) -> Blend:
         return bounded(blend, cos_theta_i) if self.bounded else blend
 
-    def prepare(self, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
-        """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,)."""
+    def prepare(self, columns: Sequence[Float], cos_theta_i: Float, active: Any = True) -> Blend:
+        """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,).
+
+        Dr.Jit's lanes that are not `active` get parameters without a meaning.
+        """
         inputs = encoding.get(self.encoding)(columns, cos_theta_i if self.directional else None)
         if ops.library(*columns, cos_theta_i) == "drjit":
-            raw = network.forward_lanes(self.layers, inputs)
+            raw = network.forward_lanes(self.layers, inputs, active)
         else:
             lanes = np.broadcast_arrays(cos_theta_i, *inputs)[1:]
             raw = list(network.forward(self.layers, np.stack(lanes, axis=-1).astype(np.float32)).T)

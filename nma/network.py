@@ -43,12 +43,30 @@ def forward(layers: Layers, x: Any) -> Any:
     return x @ matrix.T + bias
 
 
-def forward_lanes(layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float]) -> list[Float]:
+def forward_lanes(
+    layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float], active: Any = True
+) -> list[Float]:
     """Outputs for one input per list entry, on Dr.Jit: the network unrolled into the kernel, weights as literals.
 
     Inside a renderer's virtual functions this is the fast way: on LLVM, weights in memory, as `drjit.nn` has them, are
-    gathered there lane by lane, which takes ten times as long.
+    gathered there lane by lane, which takes ten times as long. Packets without an `active` lane skip the network and
+    return zeros: a renderer calls the only BSDF of a scene for rays that met nothing, too.
     """
+    import drjit as dr
+
+    if active is True:
+        return _unrolled(layers, x)
+    outputs = dr.if_stmt(
+        tuple(x),
+        active,
+        lambda *inputs: tuple(_unrolled(layers, inputs)),
+        lambda *inputs: (dr.zeros(type(inputs[0])),) * len(layers[-1][1]),
+        label="network",
+    )
+    return list(outputs)
+
+
+def _unrolled(layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float]) -> list[Float]:
     import drjit as dr
 
     x = list(x)

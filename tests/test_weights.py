@@ -270,11 +270,15 @@ def test_a_network_is_its_matrices():
     expected = np.array([w1 @ np.maximum(w0 @ row + b0, 0.0) + b1 for row in x])
     np.testing.assert_allclose(network.forward(layers, x), expected)
     assert (expected < 0).any()
-    lanes = network.forward_lanes(layers, [dr.auto.Float(c.astype(np.float32)) for c in x.T])
-    dr.eval(lanes)
-    np.testing.assert_allclose(
-        np.stack([lane.numpy() for lane in lanes], axis=-1), expected, rtol=1e-5, atol=1e-5
-    )
+    inputs = [dr.auto.Float(c.astype(np.float32)) for c in x.T]
+    for active in (True, dr.arange(dr.auto.UInt32, 5) < 3):
+        lanes = network.forward_lanes(layers, inputs, active)
+        dr.eval(lanes)
+        found = np.stack([lane.numpy() for lane in lanes], axis=-1)
+        known = slice(None) if active is True else slice(3)
+        np.testing.assert_allclose(found[known], expected[known], rtol=1e-5, atol=1e-5)
+    nowhere = network.forward_lanes(layers, inputs, dr.auto.Bool(False) & (inputs[0] > 0.0))
+    assert not any(lane.numpy().any() for lane in nowhere)
 
 
 def test_initial_layers_have_the_spread_of_their_law():

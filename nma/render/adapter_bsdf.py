@@ -88,7 +88,7 @@ def define() -> type:
             cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
             if self._curves is not None:
                 return self._curves.at(cos_theta_i, active), active
-            return self.adapter.prepare(self.inputs.columns(si, active), cos_theta_i), active
+            return self.adapter.prepare(self.inputs.columns(si, active), cos_theta_i, active), active
 
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""
