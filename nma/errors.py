@@ -1,5 +1,7 @@
 """Errors that users meet. Each message says what is wrong, where, and what to do next."""
 
+import re
+
 
 class NmaError(Exception):
     """Base of all errors raised on purpose by this package; the command line prints them without a traceback."""
@@ -25,9 +27,23 @@ class DatasetError(NmaError, ValueError):
     """A dataset is damaged, incomplete, or was made with other settings."""
 
 
+class SourceError(NmaError, ValueError):
+    """A file of measurements or weights, or a renderer's BSDF, is missing, damaged, or not what a source can read."""
+
+
 class TableError(NmaError, ValueError):
     """A table or reference file (.npz) is damaged or has the wrong shape."""
 
 
 class MissingDependencyError(NmaError, ImportError):
     """A library this feature needs is missing or too old."""
+
+
+def one_line(message: str) -> str:
+    """Mitsuba's error: where, and what is wrong, without lines of source code; of a traceback only the error."""
+    message = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip())
+    message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
+    head, traceback, rest = message.partition("Traceback (most recent call last):")
+    if traceback:
+        message = head + re.sub(r"^[\w.]+: ", "", rest.strip().splitlines()[-1])
+    return " ".join(message.split())

@@ -98,14 +98,14 @@ def _by_points(
     row = bins // (grid.theta_o * grid.phi_o)
     o = Float((bins // grid.phi_o) % grid.theta_o)
     p = Float(bins % grid.phi_o)
-    shifts = [_uniform(bins * 2 + k, seed) for k in range(2)]
+    shifts = [ava.hashed(bins * 2 + k, seed) for k in range(2)]
     lattice = [Float(x.astype(np.float32)) for x in ava.lattice(directions * _POINTS).T[:2]]
 
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
         at = row * directions + k // _POINTS
         mu = dr.gather(Float, cosines, at)
         blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
-        u, v = (_shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
+        u, v = (ava.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
         across = mu * grid.theta_i - Float(row)
         points = ava.uniform_bin_points(Float(row), o, p, (across, u, v), grid)
         value, pdf = target.eval_pdf(blend, points.wi, points.wo)
@@ -130,7 +130,7 @@ def _by_samples(
     mu = dr.gather(Float, cosines, at)
     blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
     lattice = [Float(x.astype(np.float32)) for x in ava.lattice(_SAMPLES).T]
-    u = [_shifted(dr.gather(Float, x, k), _uniform(at * 3 + n, ~seed)) for n, x in enumerate(lattice)]
+    u = [ava.shifted(dr.gather(Float, x, k), ava.hashed(at * 3 + n, ~seed)) for n, x in enumerate(lattice)]
     wo, value, pdf = target.sample(blend, Vec3(ops.safe_sqrt(1.0 - mu * mu), 0.0 * mu, mu), *u)
     value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
     directions = len(cosines) // grid.theta_i
@@ -145,19 +145,6 @@ def _sharpness(pdf: Any) -> Any:
     """Share of a value that belongs to the sharp part, 0 to 1, given its density."""
     x = pdf * (1.0 / _SHARP)
     return 1.0 - 1.0 / (1.0 + x * x)
-
-
-def _shifted(x: Any, shift: Any) -> Any:
-    """x + shift modulo 1."""
-    x = x + shift
-    return x - dr.floor(x)
-
-
-def _uniform(number: Any, seed: Any) -> Any:
-    """A fixed random number in [0, 1) for each `number`. Jarzynski and Olano 2020, "pcg"."""
-    state = (number ^ (seed * 0x9E3779B9)) * 747796405 + 2891336453
-    word = ((state >> ((state >> 28) + 4)) ^ state) * 277803737
-    return dr.auto.Float(((word >> 22) ^ word) >> 8) * (1.0 / 2**24)
 
 
 def evaluate(

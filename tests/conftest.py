@@ -32,3 +32,12 @@ def compiler() -> str:
     if found is None:
         pytest.skip("there is no C++ compiler here")
     return found
+
+
+@pytest.fixture(scope="session")
+def measurements() -> Path:
+    """Measured materials, in a folder beside the checkout: the repository holds none of them."""
+    folder = Path(__file__).parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"there are no measured materials in {folder}; `nma data` says where they come from")
+    return folder

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nma.errors import NmaError, ParamError
+from nma.errors import NmaError, ParamError, one_line
 from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.scene import bitmap_texture
@@ -47,7 +46,7 @@ def load_dict(description: Mapping[str, Any]) -> Any:
     try:
         return mi.load_dict(dict(description))
     except RuntimeError as error:
-        raise SceneError(_one_line(str(error))) from error
+        raise SceneError(one_line(str(error))) from error
 
 
 def load_scene(
@@ -69,7 +68,7 @@ def load_scene(
     try:
         scene = mi.load_file(str(path), **dict(define or {}))  # type: ignore[arg-type]
     except RuntimeError as error:
-        raise SceneError(_one_line(str(error))) from error
+        raise SceneError(one_line(str(error))) from error
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"{path} holds no scene; its outermost element must be <scene>")
     if not scene.sensors():
@@ -85,13 +84,3 @@ def _value(value: float | tuple[float, ...] | Texture) -> Any:
     if isinstance(value, Texture):
         return bitmap_texture(value.read())
     return {"type": "rgb", "value": list(value)} if isinstance(value, tuple) else value
-
-
-def _one_line(message: str) -> str:
-    """Where, and what is wrong: without lines of source code, and of a traceback of ours the error alone."""
-    message = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip())
-    message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
-    head, traceback, rest = message.partition("Traceback (most recent call last):")
-    if traceback:
-        message = head + re.sub(r"^[\w.]+: ", "", rest.strip().splitlines()[-1])
-    return " ".join(message.split())

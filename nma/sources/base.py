@@ -60,6 +60,27 @@ class Source(Protocol):
         ...
 
 
+class Values(Protocol):
+    """An appearance model that knows its value and nothing else: measurements, tables, networks, a renderer's BSDFs.
+
+    `name` is what texts call it. `isotropic` says whether turning both directions about the normal changes nothing; the
+    mirror image of a pair may still have another value, and a table's folded bins hold the mean of both.
+    """
+
+    name: str
+    isotropic: bool
+
+    def eval(self, wi: Vec3, wo: Vec3) -> Color:
+        """f(wi, wo) cos(theta_o) [1/sr] for one pair of unit directions per Dr.Jit lane; 0 below the horizon.
+
+        Linear sRGB without bounds: measured colours out of its gamut have a negative channel.
+
+        Lanes are float32, with or without derivatives, which are not followed. The call may be traced into a kernel, so
+        it neither branches on values nor reads them.
+        """
+        ...
+
+
 def throughput(walk: Walk) -> Color:
     """The walk's throughput as a colour."""
     return Color(*walk.throughput)

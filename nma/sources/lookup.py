@@ -1,0 +1,80 @@
+"""Regular grids of numbers in memory that Dr.Jit lanes look up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from importlib import import_module
+from itertools import product
+from operator import mul
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.jit import dr
+from nma.ops import Float
+
+
+class Lookup:
+    """Cells (n_1, ..., n_d, channels) of a grid in d dimensions. A position counts in cells, 0 .. n_k in dimension k.
+
+    Dimensions that are `periodic` go round; in the others, positions beyond the ends mean the cells there. Lanes may be
+    of Dr.Jit's types with or without derivatives, so that the same numbers serve tables and renderings.
+    """
+
+    def __init__(self, cells: NDArray, periodic: Sequence[bool]):
+        *self._sizes, self._channels = cells.shape
+        self._periodic = tuple(periodic)
+        # Dr.Jit loads powers of two together.
+        self._packet = 1 << (self._channels - 1).bit_length()
+        filled = np.zeros((*self._sizes, self._packet), np.float32)
+        filled[..., : self._channels] = cells
+        self._numbers = filled.ravel()
+        self._loaded: dict[str, Any] = {}
+
+    def nearest(self, position: Sequence[Float]) -> list[Float]:
+        """The numbers of the cell that holds the position, one array per channel."""
+        return self._gather([self._cell(k, dr.floor(x)) for k, x in enumerate(position)])
+
+    def linear(self, position: Sequence[Float]) -> list[Float]:
+        """The numbers at the position, interpolated between the middles of the cells, one array per channel."""
+        total = [0.0 * position[0]] * self._channels
+        for corner in self._corners(position):
+            weights, cells = zip(*corner, strict=True)
+            weight = reduce(mul, weights)
+            total = [t + weight * number for t, number in zip(total, self._gather(cells), strict=True)]
+        return total
+
+    def _corners(self, position: Sequence[Float]) -> Iterator[tuple[tuple[Float, Any], ...]]:
+        """The 2^d cells around the position: for each, its share and its number, dimension by dimension."""
+        pairs = []
+        for k, x in enumerate(position):
+            low = dr.floor(x - 0.5)
+            t = x - 0.5 - low
+            pairs.append(((1.0 - t, self._cell(k, low)), (t, self._cell(k, low + 1.0))))
+        return product(*pairs)
+
+    def _cell(self, k: int, floor: Float) -> Any:
+        """The number of a cell in dimension `k`, which may lie up to a cell beyond the ends."""
+        n, types = self._sizes[k], _types(floor)
+        if self._periodic[k]:
+            floor = dr.select(floor < 0, floor + n, dr.select(floor >= n, floor - n, floor))
+        return types.UInt32(dr.clip(floor, 0, n - 1))
+
+    def _gather(self, cells: Sequence[Any]) -> list[Float]:
+        """The numbers of the cells, given by dimension."""
+        index = cells[0]
+        for size, cell in zip(self._sizes[1:], cells[1:], strict=True):
+            index = index * size + cell
+        types = _types(index)
+        if types.__name__ not in self._loaded:
+            self._loaded[types.__name__] = types.Float(self._numbers)
+        shape = (self._packet, dr.width(index))
+        packet = dr.gather(types.ArrayXf, self._loaded[types.__name__], index, shape=shape)
+        return [packet[c] for c in range(self._channels)]
+
+
+def _types(lanes: Any) -> Any:
+    """The module of Dr.Jit that has the arrays' types."""
+    return import_module(type(lanes).__module__)

@@ -1,0 +1,181 @@
+"""Any BSDF of Mitsuba 3 as a source: from a dictionary, from XML, or a measured one from RGL's database.
+
+Only light that the front reflects counts: what is transmitted, and what the back of a two-sided BSDF reflects, is left
+out. A perfectly specular lobe has no value at a pair of directions, so BSDFs that reflect like that are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from nma.errors import ParamError, SourceError, one_line
+from nma.jit import dr
+from nma.ops import Color, Vec3
+from nma.sources import rgl
+
+# Pairs of directions that tell whether a BSDF is isotropic, and the relative change that rounding explains.
+_PAIRS = 512
+_ROUNDING = 1e-3
+
+
+class MitsubaBsdf:
+    """A BSDF (`Values`) of the variant that was chosen when it was made; without one, the GPU's or LLVM's is chosen.
+
+    `bsdf`: an instance of `mi.BSDF`. `uv`: where its textures are looked up. `isotropic` is found out by turning pairs
+    of directions, unless it is given. Raises `SourceError` for BSDFs with a perfectly specular reflection, and
+    `ParamError` in a variant that is not vectorised or not RGB.
+    """
+
+    def __init__(
+        self,
+        bsdf: Any,
+        name: str = "BSDF",
+        *,
+        uv: tuple[float, float] = (0.5, 0.5),
+        isotropic: bool | None = None,
+    ):
+        mi = choose_variant()
+        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):
+            raise SourceError(
+                f"{name}: reflects like a perfect mirror, which has no value; make it a little rough"
+            )
+        self.bsdf, self.name, self._uv, self._variant = bsdf, name, uv, mi.variant()
+        self.isotropic = self._is_isotropic() if isotropic is None else isotropic
+
+    def eval(self, wi: Vec3, wo: Vec3) -> Color:
+        """f cos(theta_o) [1/sr]."""
+        import mitsuba
+
+        mi: Any = mitsuba
+        if mi.variant() != self._variant:
+            raise ParamError(
+                f"{self.name} was made in {self._variant}, Mitsuba's variant is {mi.variant()} now"
+            )
+        with dr.suspend_grad():
+            active = mi.Bool((wi.z > 0) & (wo.z > 0))
+            si = _interaction(mi, mi.Vector3f(*wi), self._uv)
+            value = self.bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo), active)
+            value = dr.select(active, value, 0.0)
+            plain = [dr.detach(c, preserve_type=False) for c in value]
+        return Color(*(type(wi.z)(c) for c in plain))
+
+    def _is_isotropic(self) -> bool:
+        """Whether values stay when both directions are turned about the normal."""
+        rng = np.random.default_rng(0)
+        mu_i, mu_o = rng.uniform(0.05, 0.95, (2, _PAIRS))
+        phi_i, phi_o, turn = rng.uniform(0.0, 2.0 * np.pi, (3, _PAIRS))
+        sets = [self.eval(_direction(mu_i, phi_i + a), _direction(mu_o, phi_o + a)) for a in (0.0, turn)]
+        one, other = (np.stack([c.numpy() for c in value]) for value in sets)
+        return bool(np.abs(one - other).sum() <= _ROUNDING * np.abs(one).sum())
+
+
+def from_dict(description: Mapping[str, Any], name: str | None = None, **options: Any) -> MitsubaBsdf:
+    """The BSDF of a dictionary that `mi.load_dict` understands; `options` as `MitsubaBsdf` takes them.
+
+    Raises `SourceError` for what Mitsuba cannot load, and for a file of a measured material that is damaged.
+    """
+    for filename in _measured_files(description):
+        rgl.read(filename)
+    label = name or f"BSDF '{description.get('type')}'"
+    return _made(lambda mi: mi.load_dict(dict(description)), label, options)
+
+
+def from_xml(path: str | Path, **options: Any) -> MitsubaBsdf:
+    """The BSDF of an XML file whose outermost element is <bsdf>; `options` as `MitsubaBsdf` takes them."""
+    path = Path(path)
+    if not path.is_file():
+        raise SourceError(f"{path}: no such file")
+    for filename in _measured_in_xml(path.read_bytes()):
+        # Names are relative to the file that has them.
+        rgl.read(path.parent / filename)
+    return _made(lambda mi: mi.load_file(str(path)), str(path), options)
+
+
+def from_string(text: str, **options: Any) -> MitsubaBsdf:
+    """The BSDF of a fragment of XML, '<bsdf version="3.0.0" type="...">...'; `options` as `MitsubaBsdf` takes them."""
+    for filename in _measured_in_xml(text.encode()):
+        rgl.read(filename)
+    return _made(lambda mi: mi.load_string(text), "XML", options)
+
+
+def measured(path: str | Path, **options: Any) -> MitsubaBsdf:
+    """A material of RGL's database, isotropic or anisotropic, in RGB.
+
+    Raises `SourceError` for a file that is missing, damaged or spectral.
+    """
+    # Mitsuba takes a file with up to two azimuths of incidence for isotropic.
+    isotropic = len(rgl.read(path)["phi_i"]) <= 2
+    description = {"type": "measured", "filename": str(path)}
+    options = {"isotropic": isotropic} | options
+    return _made(lambda mi: mi.load_dict(description), Path(path).stem, options)
+
+
+def _measured_files(description: Mapping[str, Any]) -> Iterator[str]:
+    """The files of the measured materials in a dictionary, however deep."""
+    if description.get("type") == "measured":
+        yield str(description.get("filename"))
+    for value in description.values():
+        if isinstance(value, Mapping):
+            yield from _measured_files(value)
+
+
+def _measured_in_xml(text: bytes) -> list[str]:
+    """The files of the measured materials in XML; none where it does not parse, which Mitsuba then says."""
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return []
+    names = root.findall(".//bsdf[@type='measured']/string[@name='filename']")
+    if root.get("type") == "measured":
+        names += root.findall("string[@name='filename']")
+    return [name.get("value", "") for name in names]
+
+
+def choose_variant() -> Any:
+    """Mitsuba in a vectorised RGB variant: the one in use, or where there is none that of Dr.Jit's backend."""
+    import mitsuba
+
+    mi: Any = mitsuba  # its types change with the variant
+    if mi.variant() is None:
+        mi.set_variant("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb")
+    if not mi.variant().endswith("_ad_rgb"):
+        raise ParamError(
+            f"sources evaluate BSDFs in the variants llvm_ad_rgb and cuda_ad_rgb, not in {mi.variant()}; call "
+            "mi.set_variant('llvm_ad_rgb') first"
+        )
+    return mi
+
+
+def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> MitsubaBsdf:
+    """What `load(mi)` makes, if it is a BSDF; Mitsuba's errors as `SourceError`."""
+    mi = choose_variant()
+    try:
+        bsdf = load(mi)
+    except RuntimeError as e:
+        raise SourceError(f"{name}: {one_line(str(e))}") from None
+    if not isinstance(bsdf, mi.BSDF):
+        found = type(bsdf).__name__
+        raise SourceError(f"{name}: holds a {found}, not a BSDF; its outermost element must be <bsdf>")
+    return MitsubaBsdf(bsdf, name, **options)
+
+
+def _interaction(mi: Any, wi: Any, uv: tuple[float, float]) -> Any:
+    """A point of a flat surface seen from `wi`, with a frame for those BSDFs that bend it."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
+    si.wi = wi
+    si.uv = mi.Point2f(*uv)
+    si.n = mi.Normal3f(0.0, 0.0, 1.0)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0.0, 0.0, 1.0))
+    si.dp_du, si.dp_dv = mi.Vector3f(1.0, 0.0, 0.0), mi.Vector3f(0.0, 1.0, 0.0)
+    return si
+
+
+def _direction(mu: Any, phi: Any) -> Vec3:
+    """Lanes of unit directions from cosines and azimuths."""
+    sin = np.sqrt(1.0 - mu * mu)
+    return Vec3(*(dr.auto.Float(x.astype(np.float32)) for x in (sin * np.cos(phi), sin * np.sin(phi), mu)))

@@ -1,0 +1,115 @@
+"""The `.bsdf` files of RGL's material database: read and checked here, evaluated by Mitsuba's BSDF `measured`.
+
+Dupuy and Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering". A file is a set
+of named arrays behind a header: magic, version, number of fields, and for each its name, rank, type, offset and
+shape. Mitsuba maps it into memory without comparing offsets with its size, so that of a truncated file it reads what
+lies beyond.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.errors import SourceError
+
+_MAGIC = b"tensor_file\0"
+# Types by their number in the file; others do not occur in materials.
+_TYPES = {
+    1: "<u1",
+    2: "<i1",
+    3: "<u2",
+    4: "<i2",
+    5: "<u4",
+    6: "<i4",
+    7: "<u8",
+    8: "<i8",
+    10: "<f4",
+    11: "<f8",
+}
+
+# Fields of a material in RGB with their rank. `rgb` is (phi_i, theta_i, 3, y, x).
+_FIELDS = {
+    "description": 1,
+    "phi_i": 1,
+    "theta_i": 1,
+    "sigma": 2,
+    "ndf": 2,
+    "vndf": 4,
+    "luminance": 4,
+    "rgb": 5,
+    "jacobian": 1,
+}
+
+
+def read(path: str | Path) -> dict[str, NDArray]:
+    """The arrays of a material in RGB, by name; `SourceError` says what is wrong with the file."""
+    path = Path(path)
+    fields = read_tensors(path)
+    if "rgb" not in fields and "spectra" in fields:
+        raise SourceError(f"{path}: holds spectra; take the material's file whose name ends in _rgb.bsdf")
+    for name, rank in _FIELDS.items():
+        if name not in fields:
+            raise SourceError(f"{path}: field '{name}' is missing; copy the file again")
+        if fields[name].ndim != rank:
+            raise SourceError(f"{path}: field '{name}' has shape {fields[name].shape}, not {rank} dimensions")
+        if fields[name].dtype.kind == "f" and not np.isfinite(fields[name]).all():
+            raise SourceError(f"{path}: field '{name}' is not finite; copy the file again")
+    _check_shapes(path, fields)
+    return fields
+
+
+def read_tensors(path: str | Path) -> dict[str, NDArray]:
+    """All arrays of a tensor file, by name."""
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; see `nma data` for where RGL's come from") from None
+    except OSError as e:
+        raise SourceError(f"{path}: cannot be read: {e.strerror}") from None
+    if content[:12] != _MAGIC:
+        what = "no tensor file" if content else "empty"
+        raise SourceError(f"{path}: {what}; RGL's materials are files that end in _rgb.bsdf")
+    try:
+        return _parse(content)
+    except (struct.error, ValueError) as e:
+        raise SourceError(f"{path}: truncated or damaged ({e}); copy it again") from None
+
+
+def _parse(content: bytes) -> dict[str, NDArray]:
+    """The arrays of a tensor file's content."""
+    major, minor, count = struct.unpack_from("<BBI", content, 12)
+    if (major, minor) != (1, 0):
+        raise ValueError(f"version {major}.{minor}")
+    at, fields = 18, {}
+    for _ in range(count):
+        (length,) = struct.unpack_from("<H", content, at)
+        name = content[at + 2 : at + 2 + length].decode()
+        rank, kind, offset = struct.unpack_from("<HBQ", content, at + 2 + length)
+        if kind not in _TYPES:
+            raise ValueError(f"field '{name}' has type {kind}")
+        shape = struct.unpack_from(f"<{rank}Q", content, at + 13 + length)
+        at += 13 + length + 8 * rank
+        fields[name] = np.frombuffer(content, _TYPES[kind], math.prod(shape), offset).reshape(shape)
+    return fields
+
+
+def _check_shapes(path: Path, fields: dict[str, NDArray]) -> None:
+    """Refuses fields whose sizes do not belong together."""
+    incident = (len(fields["phi_i"]), len(fields["theta_i"]))
+    expected = {
+        "vndf": (*incident, *fields["vndf"].shape[2:]),
+        "luminance": (*incident, *fields["rgb"].shape[3:]),
+        "rgb": (*incident, 3, *fields["rgb"].shape[3:]),
+        "jacobian": (1,),
+    }
+    for name, shape in expected.items():
+        if fields[name].shape != shape:
+            raise SourceError(
+                f"{path}: field '{name}' has shape {fields[name].shape}, the others want {shape}; copy it again"
+            )

@@ -1,0 +1,120 @@
+"""`nma data`: what it says of the data sets, and that it finds what is wrong with a copy."""
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from nma import cli
+from nma.errors import SourceError
+from nma.sources import datasets, merl
+from nma.sources.datasets import DATASETS
+from nma.sources.merl import Merl
+
+
+@pytest.fixture
+def data(monkeypatch, capsys):
+    """Runs `nma data ARGUMENTS`: exit status, stdout, stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nma", "data", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+            sys.exit(0)
+        return end.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def uniform(tmp_path):
+    """A MERL file of a uniform material."""
+    path = tmp_path / "uniform.binary"
+    Merl(np.ones((3, *merl.SHAPE))).save(path)
+    return path
+
+
+def test_every_data_set_is_listed_with_its_origin_terms_and_files(data):
+    code, out, err = data()
+    assert (code, err) == (0, "")
+    assert [d.name for d in DATASETS] == ["MERL", "RGL", "NBRDF-MERL", "NBRDF-RGL"]
+    for dataset in DATASETS:
+        for text in (
+            dataset.name,
+            dataset.kind,
+            dataset.origin,
+            dataset.paper,
+            dataset.licence,
+            dataset.files,
+        ):
+            assert text in out
+        for name, (size, checksum) in dataset.known.items():
+            assert f"{name}: {size:,} bytes, SHA-256 {checksum}" in out
+
+
+def test_a_reconstruction_is_never_called_a_measurement():
+    for dataset in DATASETS:
+        assert dataset.kind.startswith("neural reconstruction" if "NBRDF" in dataset.name else "measurement")
+
+
+def test_sound_copies_are_as_known(data, measurements):
+    code, out, _ = data("check", measurements)
+    assert code == 0
+    lines = out.splitlines()
+    known = [name for dataset in DATASETS for name in dataset.known]
+    assert len(lines) >= len(known) == 6
+    for name in known:
+        (line,) = (line for line in lines if name in line)
+        assert line.startswith("ok") and line.endswith("sound, SHA-256 as known")
+
+
+def test_a_file_without_a_known_checksum_is_read(data, uniform):
+    code, out, _ = data("check", uniform)
+    assert (code, out) == (0, f"ok     MERL        {uniform}: sound; no checksum of it is known\n")
+
+
+def test_faults_are_named_file_by_file(data, uniform, measurements):
+    folder = uniform.parent
+    whole = uniform.read_bytes()
+    (folder / "cut.binary").write_bytes(whole[:-1])
+    (folder / "empty.bsdf").write_bytes(b"")
+    paper = (measurements / "rgl" / "paper_white_rgb.bsdf").read_bytes()
+    (folder / "paper_white_rgb.bsdf").write_bytes(paper[:-1])
+    (folder / "sub").mkdir()
+    shutil.copy(measurements / "rgl" / "cg_sunflower_rgb.bsdf", folder / "sub" / "mine_rgb.bsdf")
+    # Sound, and of the right size, but another file.
+    changed = bytearray(paper)
+    changed[200_000] ^= 1
+    (folder / "sub" / "paper_white_rgb.bsdf").write_bytes(changed)
+    (folder / "merl_nbrdf_weights.npz").write_bytes(b"damaged")
+    np.savez(folder / "networks.npz", names=np.array(["a"]), weights=np.zeros((1, 3)))
+    # Files of other kinds are none of its business.
+    np.savez(folder / "reference.npz", table=np.zeros(3))
+    (folder / "notes.txt").write_text("nothing")
+    code, out, err = data("check", folder)
+    assert (code, err) == (1, "")
+    found = {line.split(f"{folder}/")[1]: line.split()[0] for line in out.splitlines()}
+    assert found == {
+        "cut.binary: truncated, 34,992,011 bytes instead of 34,992,012; copy it again": "FAULT",
+        "empty.bsdf: empty; RGL's materials are files that end in _rgb.bsdf": "FAULT",
+        "merl_nbrdf_weights.npz: 7 bytes instead of 256,573; copy it again": "FAULT",
+        "networks.npz: names (1,) and weights (1, 3) are not (n,) and (n, 675); copy it again": "FAULT",
+        "paper_white_rgb.bsdf: 658,927 bytes instead of 658,928; copy it again": "FAULT",
+        "sub/mine_rgb.bsdf: sound; no checksum of it is known": "ok",
+        "sub/paper_white_rgb.bsdf: sound, but not the file of that name: its SHA-256 is another": "FAULT",
+        "uniform.binary: sound; no checksum of it is known": "ok",
+    }
+
+
+def test_what_is_no_data_set_is_said_to_be_none(data, tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
+    code, out, _ = data("check", tmp_path / "notes.txt")
+    assert (code, out.split()[0]) == (1, "FAULT")
+    assert "no file of a known data set (.binary, .bsdf, .npz)" in out
+    for path, message in ((tmp_path, "holds no file of a known data set"), (tmp_path / "no", "no such file")):
+        with pytest.raises(SourceError, match=message):
+            list(datasets.check(path))
+        code, out, err = data("check", path)
+        assert (code, out) == (1, "")
+        assert err.startswith("nma: ") and err.count("\n") == 1 and str(path) in err
