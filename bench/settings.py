@@ -19,7 +19,9 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +41,7 @@ def main() -> None:
     arguments = parse()
     head = frames.begin()
     settings = list(itertools.product(arguments.variant, arguments.scene, KINDS))
-    rows, measured = [], []
+    rows, measured, parts = [], [], unfinished(arguments)
     with frames.bar(
         "rendering", "materials", sum(len(list(subjects(s[2], arguments))) for s in settings)
     ) as advance:
@@ -47,7 +49,8 @@ def main() -> None:
             nma.render.use(variant)
             of_setting = []
             for seed, subject in enumerate(subjects(kind, arguments)):
-                of_setting.append(compare(subject, scene, seed, arguments))
+                part = parts / f"{variant}-{scene}-{kind}-{seed}.json"
+                of_setting.append(frames.common.kept(part, partial(compare, subject, scene, seed, arguments)))
                 advance()
             place = {"renderer": variant, "scene": scene, "material": kind}
             rows += summary(place, of_setting)
@@ -58,6 +61,15 @@ def main() -> None:
     frames.write(arguments.output / "settings.json", head, arguments, rows=rows, measured=measured)
     frames.common.write_text(arguments.output / "settings.md", text + "\n")
     plot(rows, arguments.output / "settings.png")
+    shutil.rmtree(parts)
+
+
+def unfinished(arguments: argparse.Namespace) -> Path:
+    """Where a run with these settings keeps what it has measured until it is complete, so that a killed one goes on."""
+    kept = "-".join(
+        str(getattr(arguments, name)) for name in ("size", "spp", "runs", "reference_spp", "rr_depth")
+    )
+    return frames.ROOT / "out/bench/settings" / kept
 
 
 def parse() -> argparse.Namespace:

@@ -1,0 +1,101 @@
+"""What a network costs in a vectorised frame: time over its multiply-adds, beside the simulation and `principled`.
+
+python bench/networks.py [--scene lights] [--networks 1x16 3x32 3x64 5x64] [--size 160] [--spp 48] [--runs 5]
+    [--rr-depth 5] [--quick] [--output out/bench]
+
+A whole frame is one kernel that no profiler looks into. So the material, textured, is rendered by adapters that differ
+in the size of their network alone, with random weights: what is left at size 0 of the line through their times is
+everything but the network. BSDFs take turns; times are medians.
+
+Writes networks.json and networks.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import frames
+import numpy as np
+import scenes
+from matplotlib.figure import Figure
+
+import nma
+from nma import network
+from nma.render.load import DEFAULT_ADAPTER
+
+SUBJECT = "worn silver"
+
+
+def main() -> None:
+    arguments = parse()
+    head = frames.begin(frames.VECTORISED)
+    subject = scenes.TEXTURED[SUBJECT]()
+    with tempfile.TemporaryDirectory() as folder:
+        bsdfs = {scenes.SIMULATION: scenes.simulation(subject), scenes.STAND_IN: scenes.stand_in(subject)}
+        products = {}
+        for name in arguments.networks:
+            adapter = random_adapter(name)
+            products[name] = sum(matrix.size for matrix, _ in adapter.layers)
+            adapter.save(Path(folder) / f"{name}.safetensors")
+            bsdfs[name] = scenes.network(subject, str(Path(folder) / f"{name}.safetensors"))
+        size, make = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
+        described = {name: make(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs.items()}
+        measured = frames.in_turns(described, arguments.spp, range(1, arguments.runs + 1))
+    seconds = {name: of_one.seconds for name, of_one in measured.items()}
+    slope, rest = np.polyfit(list(products.values()), [seconds[name] for name in products], 1)
+    rows = [[name, products.get(name), s, s / seconds[scenes.SIMULATION]] for name, s in seconds.items()]
+    print(frames.markdown(["BSDF", "multiply-adds", "seconds", f"to {scenes.SIMULATION}"], rows))
+    print(f"everything but the network {rest:.2f} s, of 5x64 the network {slope * products_of('5x64'):.2f} s")
+    frames.write(
+        arguments.output / "networks.json",
+        head,
+        arguments,
+        seconds=seconds,
+        products=products,
+        line=[slope, rest],
+    )
+    plot(seconds, products, (slope, rest), arguments.output / "networks.png")
+
+
+def parse() -> argparse.Namespace:
+    parser = frames.parser(__doc__, size=160, spp=48, runs=5)
+    parser.add_argument("--scene", choices=scenes.SCENES, default="lights")
+    parser.add_argument("--networks", nargs="+", default=["1x16", "3x32", "3x64", "5x64"])
+    return frames.parse(parser, size=32, spp=8, runs=2, networks=["1x16", "3x32"])
+
+
+def random_adapter(name: str) -> nma.Adapter:
+    """The shipped adapter with another network, whose weights mean nothing."""
+    trained = nma.Adapter.load(DEFAULT_ADAPTER)
+    ends = trained.layers[0][0].shape[1], trained.layers[-1][0].shape[0]
+    sizes = [ends[0], *network.hidden(name), ends[1]]
+    layers = network.init(np.random.default_rng(0), sizes, trained.layers[-1][1])
+    return replace(trained, layers=layers, training={})
+
+
+def products_of(name: str) -> int:
+    """Multiply-adds of one query."""
+    return sum(matrix.size for matrix, _ in random_adapter(name).layers)
+
+
+def plot(seconds: dict[str, float], products: dict[str, int], line: tuple[float, float], path: Path) -> None:
+    figure = Figure(figsize=(5.6, 3.8), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(list(products.values()), [seconds[name] for name in products], "o")
+    for name, count in products.items():
+        axes.annotate(name, (count, seconds[name]), textcoords="offset points", xytext=(6, -10))
+    ends = np.array([0, max(products.values())])
+    axes.plot(ends, line[0] * ends + line[1], "C0", linewidth=0.8)
+    for name, style in ((scenes.SIMULATION, "k-"), (scenes.STAND_IN, "k:")):
+        axes.plot(ends, [seconds[name]] * 2, style, linewidth=0.8, label=name)
+    axes.set(xlabel="multiply-adds of the network", ylabel="seconds of a frame", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    frames.save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    main()
