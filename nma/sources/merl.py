@@ -20,6 +20,7 @@ from nma import ops
 from nma.errors import SourceError
 from nma.jit import dr
 from nma.ops import Color, Vec3
+from nma.sources import files
 from nma.sources.base import Values
 from nma.sources.half_difference import angles, directions
 from nma.sources.lookup import Lookup
@@ -103,12 +104,7 @@ class Merl:
 def read(path: str | Path) -> NDArray[np.float64]:
     """The planes (3, 90, 90, 180) of a file as it has them; `SourceError` says what is wrong with it."""
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise SourceError(f"{path}: no such file; see `nma data` for where MERL's come from") from None
-    except OSError as e:
-        raise SourceError(f"{path}: cannot be read: {e.strerror}") from None
+    content = files.content(path, "MERL")
     _check_size(path, content)
     planes = np.frombuffer(content, "<f8", offset=12).reshape(3, *SHAPE).astype(np.float64)
     if not np.isfinite(planes).all():

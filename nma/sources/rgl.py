@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import SourceError
+from nma.sources import files
 
 _MAGIC = b"tensor_file\0"
 # Types by their number in the file; others do not occur in materials.
@@ -66,12 +67,7 @@ def read(path: str | Path) -> dict[str, NDArray]:
 def read_tensors(path: str | Path) -> dict[str, NDArray]:
     """All arrays of a tensor file, by name."""
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise SourceError(f"{path}: no such file; see `nma data` for where RGL's come from") from None
-    except OSError as e:
-        raise SourceError(f"{path}: cannot be read: {e.strerror}") from None
+    content = files.content(path, "RGL")
     if content[:12] != _MAGIC:
         what = "no tensor file" if content else "empty"
         raise SourceError(f"{path}: {what}; RGL's materials are files that end in _rgb.bsdf")
