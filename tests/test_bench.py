@@ -167,7 +167,7 @@ def test_scenes_render_what_is_measured(name):
 def test_without_a_name_they_are_listed():
     lines = bench().stdout.splitlines()
     names = [line.split()[0] for line in lines]
-    assert {"density", "render", "runtime", "samples", "scalar", "settings", "teaser"} <= set(names)
+    assert {"density", "networks", "render", "runtime", "samples", "scalar", "settings", "teaser"} <= set(names)
     assert all(len(line.split()) > 3 for line in lines)
     unknown = bench("no-such-bench")
     assert unknown.returncode != 0
@@ -175,7 +175,7 @@ def test_without_a_name_they_are_listed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["density", "render", "samples", "scalar", "settings", "teaser"])
+@pytest.mark.parametrize("name", ["density", "networks", "render", "samples", "scalar", "settings", "teaser"])
 def test_quick(name, tmp_path):
     run = bench(name, "--quick", "--output", tmp_path)
     assert run.returncode == 0, run.stdout + run.stderr
