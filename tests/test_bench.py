@@ -167,7 +167,8 @@ def test_scenes_render_what_is_measured(name):
 def test_without_a_name_they_are_listed():
     lines = bench().stdout.splitlines()
     names = [line.split()[0] for line in lines]
-    assert {"density", "networks", "render", "runtime", "samples", "scalar", "settings", "teaser"} <= set(names)
+    wanted = {"density", "networks", "render", "runtime", "samples", "scalar", "settings", "teaser"}
+    assert wanted <= set(names)
     assert all(len(line.split()) > 3 for line in lines)
     unknown = bench("no-such-bench")
     assert unknown.returncode != 0
