@@ -291,7 +291,7 @@ private:
         float left = 1.0f;
         for (int n = 0; n < blend.used(); ++n) {
             Pack<float>& pack = blend.packs[n];
-            auto* lanes = reinterpret_cast<Lanes<float>*>(&pack.instances);
+            Lanes<float>* lanes = pack.lanes();
             for (int f = 0; f < Blend<float>::FIELDS; ++f, index += LANES) lanes[f] = {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
             float weights[LANES] = {};
             for (int k = n * LANES; k < std::min(blend.count, (n + 1) * LANES); ++k) {
@@ -341,16 +341,14 @@ public:
         made.blend_.count = a.count;
         made.blend_.scale = a.scale + (b.scale - a.scale) * t[0];
         for (int n = 0; n < a.used(); ++n) {
-            const auto *from = lanes(a.packs[n]), *to = lanes(b.packs[n]);
-            auto* between = const_cast<Lanes<float>*>(lanes(made.blend_.packs[n]));
+            const Lanes<float> *from = a.packs[n].lanes(), *to = b.packs[n].lanes();
+            Lanes<float>* between = made.blend_.packs[n].lanes();
             for (std::size_t k = 0; k < sizeof(Pack<float>) / sizeof(Lanes<float>); ++k) between[k] = lerp(from[k], to[k], t);
         }
         return made;
     }
 
 private:
-    static const Lanes<float>* lanes(const Pack<float>& pack) { return reinterpret_cast<const Lanes<float>*>(&pack); }
-
     std::vector<Material> nodes_;
 };
 

@@ -22,6 +22,10 @@ struct Pack {
     Principled<Lanes<T>> instances;
     Lanes<T> weights;
     Odds<Lanes<T>> odds;
+
+    // All its numbers in this order, the fields of the instances first.
+    Lanes<T>* lanes() { return reinterpret_cast<Lanes<T>*>(this); }
+    const Lanes<T>* lanes() const { return reinterpret_cast<const Lanes<T>*>(this); }
 };
 
 // Instances and their weights, which sum to one. `weigh` fills in the odds, and `scale`, which dims the whole.
@@ -41,13 +45,12 @@ struct Blend {
         static_assert(sizeof(Principled<Lanes<T>>) == FIELDS * sizeof(Lanes<T>));
         Pack<T>& pack = packs[k / LANES];
         const auto* from = reinterpret_cast<const T*>(&instance);
-        auto* to = reinterpret_cast<Lanes<T>*>(&pack.instances);
-        for (int f = 0; f < FIELDS; ++f) to[f].set(k % LANES, from[f]);
+        for (int f = 0; f < FIELDS; ++f) pack.lanes()[f].set(k % LANES, from[f]);
         pack.weights.set(k % LANES, weight);
     }
     Principled<T> instance(int k) const {
         Principled<T> found;
-        const auto* from = reinterpret_cast<const Lanes<T>*>(&packs[k / LANES].instances);
+        const Lanes<T>* from = packs[k / LANES].lanes();
         auto* to = reinterpret_cast<T*>(&found);
         for (int f = 0; f < FIELDS; ++f) to[f] = from[f][k % LANES];
         return found;
