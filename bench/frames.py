@@ -43,7 +43,7 @@ REFERENCES = ROOT / "out/bench/references"
 # Of a frame in one piece, which bounds memory.
 MOST_SAMPLES = 1 << 23
 # Parts of a converged picture; their spread tells its noise.
-PARTS = 4
+PARTS, TEASER_PARTS = 4, 16
 # Seeds of converged pictures lie beyond those of frames.
 REFERENCE_SEED = 1_000_000
 EVEN = 1.1  # efficiencies closer than this factor are called even
@@ -149,10 +149,12 @@ def converged(
     return Converged(np.mean(pictures, axis=0), float(np.var(pictures, axis=0, ddof=1).mean()) / parts)
 
 
-def kept_as(scene: str, arguments: argparse.Namespace) -> Path:
-    """Where the parts of a converged picture stay."""
+def converged_teaser(description: Mapping[str, Any], arguments: argparse.Namespace) -> Converged:
+    """The teaser's, in parts that stay in REFERENCES, with a progress bar."""
     settings = f"{arguments.size}px_rr-{arguments.rr_depth}_{arguments.variant}"
-    return REFERENCES / f"{scene}-{digest()}_{settings}"
+    keep = REFERENCES / f"teaser-{digest()}_{settings}"
+    with bar("converged picture", "parts", TEASER_PARTS) as advance:
+        return converged(description, arguments.reference_spp, keep, TEASER_PARTS, advance)
 
 
 def squared_errors(pictures: Array, reference: Converged) -> Array:

@@ -24,7 +24,6 @@ from matplotlib.figure import Figure
 
 import nma
 
-PARTS = 16
 # Up to so many samples per pixel there are more runs, of so many in total each.
 CHEAP = 32
 Curve = dict[int, dict[str, float | None]]
@@ -34,14 +33,7 @@ def main() -> None:
     arguments = parse()
     head = frames.begin(arguments.variant)
     described = describe(arguments)
-    with frames.bar("converged picture", "parts", PARTS) as advance:
-        reference = frames.converged(
-            described[scenes.SIMULATION],
-            arguments.reference_spp,
-            frames.kept_as("teaser", arguments),
-            PARTS,
-            advance,
-        )
+    reference = frames.converged_teaser(described[scenes.SIMULATION], arguments)
     curves = measure(described, reference, arguments)
     print(table(curves))
     print(f"the converged picture's own squared error, subtracted: {reference.noise:.1e}")

@@ -65,11 +65,12 @@ def main() -> None:
 
 
 def unfinished(arguments: argparse.Namespace) -> Path:
-    """Where a run with these settings keeps what it has measured until it is complete, so that a killed one goes on."""
+    """Where a run with these settings keeps what it has measured until it is complete, so that a killed one goes on.
+    What was measured in other scenes does not count."""
     kept = "-".join(
         str(getattr(arguments, name)) for name in ("size", "spp", "runs", "reference_spp", "rr_depth")
     )
-    return frames.ROOT / "out/bench/settings" / kept
+    return frames.ROOT / "out/bench/settings" / f"{scenes.digest()}-{kept}"
 
 
 def parse() -> argparse.Namespace:

@@ -28,7 +28,6 @@ from nma.contact_sheet import Row, contact_sheet
 from nma.image_metrics import errors
 from nma.render.load import DEFAULT_ADAPTER
 
-PARTS = 16
 ENLARGED = 4
 Figures = Mapping[str, Mapping[str, Any]]
 # What is enlarged: a name, and the upper left corner as shares of width and height.
@@ -44,10 +43,7 @@ def main() -> None:
         "nma": partial(scenes.network, name=arguments.adapter),
     }
     described = {name: scenes.teaser(model, size, arguments.rr_depth) for name, model in models.items()}
-    with frames.bar("converged picture", "parts", PARTS) as advance:
-        reference = frames.converged(
-            described["layered"], arguments.reference_spp, frames.kept_as("teaser", arguments), PARTS, advance
-        )
+    reference = frames.converged_teaser(described["layered"], arguments)
     measured = frames.in_turns(described, arguments.spp, range(arguments.runs))
     rows = {name: figures(own, reference) for name, own in measured.items()}
     ratios = frames.ratios(rows["nma"], rows["layered"])
