@@ -125,6 +125,11 @@ class Adapter:
         return output_size(self.instances, self.target)
 
     @property
+    def anisotropic(self) -> bool:
+        """Whether the view's azimuth matters: `prepare` wants its whole direction."""
+        return self.encoding in encoding.ANISOTROPIC
+
+    @property
     def in_plane(self) -> bool:
         """Whether the blend holds in the plane of incidence (`nma.target.Plane`) instead of every local frame."""
         return any(p.in_plane for p in self.target)
@@ -140,12 +145,19 @@ class Adapter:
     def _bounded(self, blend: Blend, cos_theta_i: Float) -> Blend:
         return bounded(blend, cos_theta_i) if self.bounded else blend
 
-    def prepare(self, columns: Sequence[Float], cos_theta_i: Float, active: Any = True) -> Blend:
+    def prepare(
+        self,
+        columns: Sequence[Float],
+        cos_theta_i: Float,
+        active: Any = True,
+        tangent: encoding.Tangent | None = None,
+    ) -> Blend:
         """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,).
 
-        Dr.Jit's lanes that are not `active` get parameters without a meaning.
+        Anisotropic adapters want `tangent`, the view direction's x and y, too. Dr.Jit's lanes that are not `active` get
+        parameters without a meaning.
         """
-        inputs = encoding.get(self.encoding)(columns, cos_theta_i if self.directional else None)
+        inputs = encoding.get(self.encoding)(columns, cos_theta_i if self.directional else None, tangent)
         if ops.library(*columns, cos_theta_i) == "drjit":
             raw = network.forward_lanes(self.layers, inputs, active)
         else:
@@ -170,6 +182,11 @@ class Adapter:
             )
         if self.instances < 1:
             raise WeightsError(f"{path}: a blend of {self.instances} instances; train again")
+        if self.anisotropic and (self.in_plane or not self.directional):
+            raise WeightsError(
+                f"{path}: an anisotropic adapter whose target holds in the plane of incidence, or ignores the "
+                "direction; train again"
+            )
         if self.in_plane and not self.directional:
             raise WeightsError(
                 f"{path}: stretched in the plane of incidence without a direction; train again"

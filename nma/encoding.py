@@ -9,29 +9,47 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from nma import ops
-from nma.errors import WeightsError
+from nma.errors import ParamError, WeightsError
 from nma.microfacet import fresnel_conductor, fresnel_dielectric
 from nma.ops import Float
 from nma.params import LAYERED3, ParamSpace
 
-# Takes one array per parameter column, and cos(theta_i) or None for an adapter whose parameters ignore the direction.
-Encoder = Callable[[Sequence[Float], Float | None], list[Float]]
+# Where the view direction points along the surface: its x and y. Isotropic encodings do not look at it.
+Tangent = tuple[Float, Float]
+# Takes one array per parameter column; cos(theta_i), or None for an adapter whose parameters ignore the direction; and
+# the rest of the direction, which anisotropic encodings need.
+Encoder = Callable[[Sequence[Float], Float | None, Tangent | None], list[Float]]
 
 # Cosine of 84 degrees: where the reflectance of metals dips before it rises to 1.
 _GRAZING = 0.1045
 
 
-def raw(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]:
+def raw(columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None) -> list[Float]:
     """The parameters as they are, then cos(theta_i): the paper's input."""
     return [*columns] if cos_theta_i is None else [*columns, cos_theta_i]
 
 
-def direction(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]:
+def direction(
+    columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None
+) -> list[Float]:
     """cos(theta_i) alone, scaled to [-1, 1], or the constant 1: the input of an adapter for one material."""
     return [1.0] if cos_theta_i is None else [2.0 * cos_theta_i - 1.0]
 
 
-def layered3(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]:
+def azimuth(
+    columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None
+) -> list[Float]:
+    """The whole direction, for one anisotropic material: its cosine, and its azimuth once and twice, both of which fade
+    towards normal incidence, where there is none."""
+    if cos_theta_i is None or tangent is None:
+        raise ParamError("the encoding 'azimuth' needs the whole view direction: give `tangent`, its x and y")
+    x, y = tangent
+    return [2.0 * cos_theta_i - 1.0, x, y, x * x - y * y, 2.0 * x * y]
+
+
+def layered3(
+    columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None
+) -> list[Float]:
     """Physical quantities of a coated conductor: widths by their logarithm, the conductor by its reflectance inside the
     coat at normal incidence and at 84 degrees, the coat's own Fresnel term at wi and the medium's transmittance along
     the refracted direction."""
@@ -53,7 +71,15 @@ def layered3(columns: Sequence[Float], cos_theta_i: Float | None) -> list[Float]
     return [2.0 * x - 1.0 for x in unit]
 
 
-ENCODERS: dict[str, Encoder] = {"raw": raw, "direction": direction, "layered3": layered3}
+ENCODERS: dict[str, Encoder] = {
+    "raw": raw,
+    "direction": direction,
+    "azimuth": azimuth,
+    "layered3": layered3,
+}
+# Those of a single material, which see the direction alone; and those that tell azimuths apart.
+SINGLE = ("direction", "azimuth")
+ANISOTROPIC = ("azimuth",)
 
 
 def get(name: str) -> Encoder:
@@ -67,4 +93,4 @@ def get(name: str) -> Encoder:
 
 def size(name: str, space: ParamSpace, directional: bool) -> int:
     """Number of network inputs that an encoding makes of a class, with or without the direction."""
-    return len(get(name)([0.5] * space.size, 0.5 if directional else None))
+    return len(get(name)([0.5] * space.size, 0.5 if directional else None, (0.5, 0.5)))

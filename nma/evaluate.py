@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ava, metrics, ops, target
+from nma import ava, encoding, metrics, ops, target
 from nma.adapter import Adapter
 from nma.errors import ParamError, TableError
 from nma.jit import dr
@@ -54,6 +54,8 @@ def tabulate_adapter(
     With fewer `directions`, the cos(theta_i) in each row (32), it is faster and less exact in proportion.
     Raises `ParamError` for parameters outside of the training range, or moves them to it with `clamp`.
     """
+    if adapter.anisotropic:
+        raise TableError("an anisotropic adapter has no isotropic table; compare it by pairs (nma.pairs)")
     params = _known(adapter, params, clamp)
     strata = np.arange(grid.theta_i * (directions or _DIRECTIONS))
     jitter = (strata * 0.6180339887 + 0.31 + shift) % 1.0
@@ -63,7 +65,7 @@ def tabulate_adapter(
 
 def _known(adapter: Adapter, params: NDArray, clamp: bool) -> NDArray[np.float64]:
     """The parameters, if the adapter was trained for such."""
-    if adapter.encoding != "direction":
+    if adapter.encoding not in encoding.SINGLE:
         return adapter.space.check(params, "training", clamp)
     params, fitted = adapter.space.check(params), adapter.training.get("params")
     if fitted is not None and not np.allclose(params, fitted, rtol=1e-5):

@@ -39,14 +39,22 @@ def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
     difference = np.abs(a - b)
     mse = np.mean(difference**2)
     return {
-        "log_loss": float(np.mean(np.abs(np.log1p(a) - np.log1p(b)))),
-        "ae": float(difference.mean()),
-        "smape": float(np.mean(2 * difference / (np.abs(a) + np.abs(b) + EPS))),
+        **value_metrics(a, b),
         "mape": float(np.mean(difference / (b + EPS))),
         "mrse": float(np.mean(difference**2 / (b**2 + EPS))),
         "psnr": float(10 * np.log10(b.max() ** 2 / mse)) if mse > 0 and b.max() > 0 else math.inf,
         "albedo_error": float(np.mean(np.abs(_albedo(a) - _albedo(b)))),
         "noise_floor": noise_floor(b, error),
+    }
+
+
+def value_metrics(a: NDArray, b: NDArray) -> dict[str, float]:
+    """The figures that make sense of any values of f cos(theta_o), not only of bins: log_loss, ae and smape."""
+    difference = np.abs(a - b)
+    return {
+        "log_loss": float(np.mean(np.abs(np.log1p(a) - np.log1p(b)))),
+        "ae": float(difference.mean()),
+        "smape": float(np.mean(2 * difference / (np.abs(a) + np.abs(b) + EPS))),
     }
 
 

@@ -142,7 +142,7 @@ class ParamSpace:
 
     def columns(self, bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper bound of every column."""
-        pairs = np.array([p.bounds(bounds) for p in self.params for _ in range(p.size)])
+        pairs = np.array([p.bounds(bounds) for p in self.params for _ in range(p.size)]).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 
     def sample(
@@ -159,7 +159,7 @@ class ParamSpace:
             raise ParamError(
                 f"unknown population '{population}'; known are {', '.join(get_args(Population))}"
             )
-        out = np.concatenate([p.draw(rng, n) for p in self.params], axis=1)
+        out = np.concatenate([np.empty((n, 0)), *(p.draw(rng, n) for p in self.params)], axis=1)
         if not any(p.law == "conductor" for p in self.params) or population == "range":
             return out
         metals = load_conductors()
@@ -213,4 +213,7 @@ LAYERED3 = ParamSpace(
     ),
 )
 
-SPACES = {LAYERED3.name: LAYERED3}
+# A single material, of which nothing is known but its values: measured, tabulated, or somebody else's BSDF.
+MEASURED = ParamSpace("measured", ())
+
+SPACES = {space.name: space for space in (LAYERED3, MEASURED)}

@@ -28,7 +28,7 @@ Array = NDArray[np.float32]
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
 # Floats of an opaque material, and the boundary in bytes that it lies on.
-_MATERIAL, _ALIGNMENT = 152, 16
+_MATERIAL, _ALIGNMENT = 168, 16
 _MESSAGE = 500
 
 

@@ -79,6 +79,12 @@ class Tables:
     walks: NDArray[np.int64]
     error: NDArray[np.floating] | None = None
 
+    @property
+    def grid(self) -> Grid:
+        """The resolution, from the shape of `values`."""
+        theta_i, *phi_i, theta_o, phi_o, _ = self.values.shape[1:]
+        return Grid(theta_i, theta_o, phi_o, *phi_i)
+
     def albedo(self) -> NDArray[np.float64]:
         """Directional albedo (n, theta_i[, phi_i], 3): 2 pi times the mean over the bins of wo."""
         return 2.0 * math.pi * self.values.mean(axis=(-3, -2), dtype=np.float64)

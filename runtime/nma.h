@@ -163,7 +163,8 @@ private:
             {"base_color", offsetof(P, base_color)}, {"roughness", offsetof(P, roughness)}, {"metallic", offsetof(P, metallic)},
             {"specular", offsetof(P, specular)}, {"spec_tint", offsetof(P, spec_tint)}, {"sheen", offsetof(P, sheen)},
             {"sheen_tint", offsetof(P, sheen_tint)}, {"clearcoat", offsetof(P, clearcoat)}, {"clearcoat_gloss", offsetof(P, clearcoat_gloss)},
-            {"anisotropic", offsetof(P, anisotropic)}, {"flatness", offsetof(P, flatness)}};
+            {"anisotropic", offsetof(P, anisotropic)}, {"flatness", offsetof(P, flatness)},
+            {"fade", offsetof(P, fade)}, {"fade_width", offsetof(P, fade_width)}};
         in_plane_ |= p.in_plane;
         for (const auto& [name, offset] : FIELDS)
             if (p.name == name && p.size == (p.name == "base_color" ? 3 : 1)) {

@@ -31,7 +31,7 @@ typedef struct nma_curves nma_curves;
 
 /* A material at one shading point, on a boundary of 16 bytes. */
 typedef struct {
-    NMA_ALIGNED float opaque[152];
+    NMA_ALIGNED float opaque[168];
 } nma_material;
 
 /* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to one

@@ -3,20 +3,23 @@
 
 namespace {
 
+constexpr int FIELDS = nma::Blend<float>::FIELDS;
+
 // The fields of an instance in the order of `Principled`, then for the next one, and all weights at the end.
 template <class T>
 nma::Blend<T> blend_of(const T* numbers, int count) {
     nma::Blend<T> made(count);
     for (int k = 0; k < count; ++k) {
-        const T* p = numbers + 13 * k;
-        made.set(k, {{p[0], p[1], p[2]}, p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11], p[12]}, numbers[13 * count + k]);
+        nma::Principled<T> instance;
+        std::memcpy(&instance, numbers + FIELDS * k, sizeof(instance));
+        made.set(k, instance, numbers[FIELDS * count + k]);
     }
     return made;
 }
 
 template <class T>
 void evaluate(int n, int count, bool bounded, const T* blends, const T* wi, const T* wo, T* out) {
-    for (int i = 0; i < n; ++i, blends += 14 * count, wi += 3, wo += 3, out += 4) {
+    for (int i = 0; i < n; ++i, blends += (FIELDS + 1) * count, wi += 3, wo += 3, out += 4) {
         nma::Blend<T> blend = blend_of(blends, count);
         nma::weigh(blend, wi[2], bounded);
         const auto e = nma::eval_pdf<T>(blend, {wi[0], wi[1], wi[2]}, {wo[0], wo[1], wo[2]});
@@ -39,7 +42,7 @@ void evaluate_double(int n, int count, bool bounded, const double* blends, const
 
 // Rows of wo, value and pdf.
 void sample_double(int n, int count, const double* blends, const double* wi, const double* u, double* out) {
-    for (int i = 0; i < n; ++i, blends += 14 * count, wi += 3, u += 3, out += 7) {
+    for (int i = 0; i < n; ++i, blends += (FIELDS + 1) * count, wi += 3, u += 3, out += 7) {
         nma::Blend<double> blend = blend_of(blends, count);
         nma::weigh(blend, wi[2], false);
         const auto s = nma::sample<double>(blend, {wi[0], wi[1], wi[2]}, u[0], u[1], u[2]);

@@ -6,8 +6,11 @@ from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 
 
-def random_principled(rng: np.random.Generator, n: int, dialect: bool = True) -> Principled:
-    """(n,) sets: widths spread over decades, pure cases frequent; `dialect` adds what the paper leaves out."""
+def random_principled(
+    rng: np.random.Generator, n: int, dialect: bool = True, fades: bool = False
+) -> Principled:
+    """(n,) sets: widths spread over decades, pure cases frequent; `dialect` adds what the paper leaves out, `fades` what
+    Mitsuba's BSDF does not have."""
 
     def often_pure():
         u = rng.random(n)
@@ -25,13 +28,20 @@ def random_principled(rng: np.random.Generator, n: int, dialect: bool = True) ->
         clearcoat_gloss=often_pure(),
         anisotropic=often_pure() * dialect,
         flatness=often_pure() * dialect,
+        **_fades(rng, n) if fades else {},
     )
 
 
-def random_blend(rng: np.random.Generator, n: int, n_instances: int, dialect: bool = True) -> Blend:
+def _fades(rng: np.random.Generator, n: int) -> dict:
+    return {"fade": rng.uniform(-0.3, 1.0, n), "fade_width": 10.0 ** rng.uniform(-1.3, 0.0, n)}
+
+
+def random_blend(
+    rng: np.random.Generator, n: int, n_instances: int, dialect: bool = True, fades: bool = False
+) -> Blend:
     """(n,) blends of instances with random weights that sum to one."""
     weights = rng.dirichlet(np.ones(n_instances), n).T
-    return Blend(tuple(random_principled(rng, n, dialect) for _ in range(n_instances)), tuple(weights))
+    return Blend(tuple(random_principled(rng, n, dialect, fades) for _ in range(n_instances)), tuple(weights))
 
 
 def random_directions(rng: np.random.Generator, n: int) -> Vec3:

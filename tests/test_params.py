@@ -138,7 +138,7 @@ def test_an_unknown_population_is_refused():
 
 
 def test_the_class_is_table_1():
-    assert SPACES == {"layered3": LAYERED3}
+    assert SPACES["layered3"] is LAYERED3
     assert tuple(p.name for p in LAYERED3.params) == NAMES
     assert LAYERED3.size == 13
     assert [(s.start, s.stop) for s in LAYERED3.slices.values()] == [

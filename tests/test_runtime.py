@@ -29,7 +29,9 @@ CASES = 4000
 SETS = ["fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16"]
 COMPACT = 0x100
 # Floats of an opaque material.
-MATERIAL = 152
+MATERIAL = 168
+# Numbers of an instance.
+FIELDS = len(target.Principled._fields) + 2
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def cases(seed=0, count=2):
     """Random blends and directions; in half of the pairs wo lies within the specular lobe of the first instance."""
     rng = np.random.default_rng(seed)
     blend, wi, wo = (
-        random_blend(rng, CASES, count),
+        random_blend(rng, CASES, count, fades=True),
         random_directions(rng, CASES),
         random_directions(rng, CASES),
     )
@@ -97,9 +99,9 @@ def unflat(columns):
     """Inverse of `flat`, from its columns."""
     instances = []
     for k in range(2):
-        p = columns[13 * k : 13 * k + 13]
+        p = columns[FIELDS * k : FIELDS * (k + 1)]
         instances.append(target.Principled(Vec3(*p[:3]), *p[3:]))
-    return target.Blend(tuple(instances), tuple(columns[26:]))
+    return target.Blend(tuple(instances), tuple(columns[2 * FIELDS :]))
 
 
 def test_samples_are_those_of_the_target(library):

@@ -49,7 +49,9 @@ class Oracle:
     def __init__(self, p: Principled):
         mi.set_variant("llvm_ad_rgb")
         self.side = int(np.sqrt(p.roughness.size))
-        scalars = {k: v for k, v in p._asdict().items() if k not in ("base_color", "specular")}
+        scalars = {
+            k: v for k, v in p._asdict().items() if k not in ("base_color", "specular", "fade", "fade_width")
+        }
         textures = {k: self.texture(v) for k, v in scalars.items()}
         self.bsdf = mi.load_dict(
             {
@@ -219,12 +221,13 @@ def test_derivatives_are_finite_everywhere():
         ((1, 0, 1e-6), (1, 0, 1e-6)), ((0, 1, 1e-7), (0, 0, 1)),
     ]  # fmt: skip
     pairs = np.array(special, np.float32)
-    params = (*target.PRINCIPLED_PARAMS, target.TargetParam("anisotropic"), target.TargetParam("flatness"))
-    raw = rng.normal(size=(400, 1, 13)) * rng.choice([1, 10, 100, 1000], (400, 1, 1))
+    params = target.MEASURED_PARAMS
+    size = target.output_size(1, params)
+    raw = rng.normal(size=(400, 1, size)) * rng.choice([1, 10, 100, 1000], (400, 1, 1))
     raw[0] = 0.0
 
     def total(raw, wi, wo):
-        blend = target.decode([raw[..., k] for k in range(13)], 1, params)
+        blend = target.decode([raw[..., k] for k in range(size)], 1, params)
         value, pdf = target.eval_pdf(blend, Vec3(*wi), Vec3(*wo))
         return sum(jnp.sum(jnp.log1p(c)) for c in (*value, pdf))
 

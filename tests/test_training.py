@@ -267,7 +267,9 @@ def test_the_huber_loss_seeks_the_mean_of_noisy_bins_and_the_log_loss_their_medi
     batch = Batch(
         columns=np.zeros((13, 4000), np.float32),
         mu=rows + 0.5,
+        phi=rows,
         i=rows + 20,
+        a=rows,
         o=rows[None] + 20,
         p=rows[None] + 10,
         shift=np.zeros((3, 1, 4000), np.float32),

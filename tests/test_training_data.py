@@ -18,7 +18,7 @@ pytest.importorskip("optax", reason="training needs optax, the extra [train]", e
 from test_training import FALSE_ALARM, TINY, batch_of, lambertian
 
 from nma.dataset import Settings, simulate_block
-from nma.table import ISOTROPIC
+from nma.table import ISOTROPIC, Grid
 from nma.train.data import Batch, BinSampler, Pool, Stream, batches
 
 
@@ -33,7 +33,8 @@ def test_weights_undo_the_choice_of_bins(law, count):
     """Weighted means of functions of the bin are those of a uniform choice, in every row (Z-tests)."""
     sampler, rng, n = BinSampler(law), np.random.default_rng(7), 20_000
     for row in (0, 20, 39):
-        o, p, weight = sampler.draw(rng, np.full(n, row), count)
+        rows = np.full(n, row)
+        o, p, weight = sampler.draw(rng, rows, 0 * rows, count)
         assert o.shape == p.shape == weight.shape == (count, n)
         assert o.min() >= 0
         assert o.max() <= 39
@@ -73,6 +74,21 @@ def test_a_batch_is_what_the_tables_say(tables):
     assert (batch_of(tables, TINY, 4).mu != batch.mu).all()
 
 
+def test_weights_undo_the_choice_of_anisotropic_bins():
+    """The same over the azimuths of both directions; half of the bins lie around the mirror direction."""
+    grid, rng, n = Grid(theta_i=10, theta_o=20, phi_o=40, phi_i=20), np.random.default_rng(8), 20_000
+    sampler = BinSampler("mirror", grid)
+    for row, turn in ((0, 0), (4, 13), (9, 19)):
+        o, p, weight = sampler.draw(rng, np.full(n, row), np.full(n, turn), 8)
+        mirror = (2 * turn + 1 + 20) % 40
+        there = (o == 2 * row + 1) & (p == mirror)
+        for function, expected in ((1.0, 1.0), (o, 9.5), (p, 19.5), (there, 1 / 800)):
+            estimates = (weight * function).mean(axis=0)
+            error = max(estimates.std() / math.sqrt(n), 1e-9)
+            assert abs(estimates.mean() - expected) < norm.isf(0.5 * FALSE_ALARM / 12) * error
+        assert there.mean() > 10 / 800
+
+
 def test_albedos_within_a_row_follow_its_neighbours(tables):
     """Exact for albedos linear in the cosine; the mean over a row stays the table's, whatever the albedo."""
     pool = Pool.of(tables)
@@ -81,8 +97,10 @@ def test_albedos_within_a_row_follow_its_neighbours(tables):
     any_albedo = replace(pool, albedo=np.random.default_rng(9).random((6, 40, 3)))
     i, t = (x.ravel() for x in np.meshgrid(rows, offsets, indexing="ij"))
     m, mu = i % 6, (i + t) / 40
-    np.testing.assert_allclose(linear.albedo_at(m, i, mu), np.tile(0.1 + 0.8 * mu[:, None], 3), rtol=1e-12)
-    found = any_albedo.albedo_at(m, i, mu).reshape(40, 8, 3).mean(axis=1)
+    np.testing.assert_allclose(
+        linear.albedo_at(m, i, 0 * i, mu), np.tile(0.1 + 0.8 * mu[:, None], 3), rtol=1e-12
+    )
+    found = any_albedo.albedo_at(m, i, 0 * i, mu).reshape(40, 8, 3).mean(axis=1)
     np.testing.assert_allclose(found, any_albedo.albedo[rows % 6, rows], rtol=1e-12)
 
 

@@ -47,6 +47,7 @@ FUNCTIONS: tuple[Callable, ...] = (
     principled.gtr1_d,
     principled.diffuse_terms,
     principled.spec_fresnel,
+    principled.faded,
     principled.eval_pdf_lobes,
     albedo.diffuse_albedo,
     albedo.spec_albedo,

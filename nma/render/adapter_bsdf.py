@@ -1,8 +1,8 @@
 """Mitsuba 3 BSDF `nma`: an expensive source material as its adapter sees it, a blend of Principled BRDFs.
 
 The network maps source parameters and cos(theta_i) to the blend; value, density and sampling are those of the blend.
-Without textures it runs when the scene is loaded, into curves over cos(theta_i); with textures at every shading point,
-once for all that a path tracer asks there. Inputs: `nma.render.inputs`. One-sided; wrap it in `twosided` if needed.
+Without textures it runs when the scene is loaded, into curves over cos(theta_i); with textures, and for anisotropic
+adapters, at every shading point, once for all that a path tracer asks there. Inputs: `nma.render.inputs`. One-sided; wrap it in `twosided` if needed.
 
 Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond its training
 range are moved there instead of refused; and the parameters of the adapter's class, or a `material` that has them.
@@ -40,9 +40,11 @@ def define() -> type:
             found = self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
             self.adapter = Adapter.load(found)
             self.inputs = Inputs(self.adapter.space, props, "training", props.get("clamp", False))
-            self._curves = None if self.inputs.textured else Curves(self.adapter, self.inputs.columns())
+            self._curves = self._make_curves()
             self._warned = False
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            if self.adapter.anisotropic:
+                flags |= mi.BSDFFlags.Anisotropic
             if self.inputs.textured:
                 flags |= mi.BSDFFlags.SpatiallyVarying
             self.m_components = [flags]
@@ -53,8 +55,7 @@ def define() -> type:
 
         def parameters_changed(self, keys: Any = ()) -> None:
             self.inputs.check(keys)
-            if not self.inputs.textured:
-                self._curves = Curves(self.adapter, self.inputs.columns())
+            self._curves = self._make_curves()
 
         def to_string(self) -> str:
             return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
@@ -79,6 +80,12 @@ def define() -> type:
             found = _eval_pdf(blend, plane, si, wo, active)
             return *found, *_sample(blend, plane, si, sample1, sample2, active)
 
+        def _make_curves(self) -> Curves | None:
+            """What spares the network where nothing but cos(theta_i) varies."""
+            if self.inputs.textured or self.adapter.anisotropic:
+                return None
+            return Curves(self.adapter, self.inputs.columns())
+
         def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
             """The blend at `si`, and the lanes that see the front."""
             self._warn_of_light_paths(ctx)
@@ -88,7 +95,8 @@ def define() -> type:
             cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
             if self._curves is not None:
                 return self._curves.at(cos_theta_i, active), active
-            return self.adapter.prepare(self.inputs.columns(si, active), cos_theta_i, active), active
+            columns, tangent = self.inputs.columns(si, active), (si.wi.x, si.wi.y)
+            return self.adapter.prepare(columns, cos_theta_i, active, tangent), active
 
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""

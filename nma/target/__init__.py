@@ -2,6 +2,8 @@
 
 from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.decode import (
+    ANISOTROPIC_PARAMS,
+    MEASURED_PARAMS,
     PRINCIPLED_PARAMS,
     STRETCHED_PARAMS,
     TARGETS,
@@ -16,6 +18,8 @@ from nma.target.plane import Plane
 from nma.target.principled import Principled, eval_principled
 
 __all__ = [
+    "ANISOTROPIC_PARAMS",
+    "MEASURED_PARAMS",
     "PRINCIPLED_PARAMS",
     "STRETCHED_PARAMS",
     "TARGETS",

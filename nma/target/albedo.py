@@ -42,7 +42,7 @@ class Albedos(NamedTuple):
 
 
 def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
-    """Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0."""
+    """Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0, and nothing fades."""
     weight = schlick_weight(cos_theta_i)
     return Albedos(
         diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from nma import ops
@@ -71,7 +71,23 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
 # twice, say. The width along the plane is 1/6.4 to 6.9 times that across it.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
-TARGETS = {"principled": PRINCIPLED_PARAMS, "stretched": STRETCHED_PARAMS}
+# What measured materials need besides. RGL's, say, are zero where the half vector is tilted by more than about 70 degrees:
+# the instrument does not reach there. A wide fade shapes the diffuse lobe.
+MEASURED_PARAMS = (
+    *STRETCHED_PARAMS,
+    TargetParam("flatness"),
+    TargetParam("fade", low=-0.3),
+    TargetParam("fade_width", low=0.01, high=1.5, scale="log"),
+)
+# The same for materials that know no plane of incidence but axes of their own: x and y of the surface.
+ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
+
+TARGETS = {
+    "principled": PRINCIPLED_PARAMS,
+    "stretched": STRETCHED_PARAMS,
+    "measured": MEASURED_PARAMS,
+    "anisotropic": ANISOTROPIC_PARAMS,
+}
 
 
 def params_to_json(params: Sequence[TargetParam]) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ Deliberate differences from Mitsuba's plugin, all of them small:
 - The cosine between a direction and the half vector is |wi + wo| / 2, the same for both directions. Mitsuba takes the
   dot product of `wi`, which rounding spoils where the directions are nearly opposite: both grazing, forward.
 - Tints divide by max(luminance, 1e-6), so they fade for colours darker than that instead of switching to white at zero.
+- Instances may fade out towards grazing half vectors (`fade`), where measurements end; Mitsuba's have no such parameter.
 - Directions within 1e-9 of the horizon are invalid, as are those below it (no back side).
 - Lobes are chosen by their estimated albedo, and one density covers the whole blend (`nma.target.blend`).
 
@@ -35,6 +36,7 @@ class Principled(NamedTuple):
     """Parameters of one Principled BRDF, in [0, 1] each (`specular` up to 1.8); the first nine hold the paper's 11.
 
     `anisotropic` stretches the specular lobe along x; `flatness` blends towards the fake subsurface of Burley 2015.
+    Around half vectors at the cosine `fade` to the normal the whole fades out, within `fade_width`; 0 and 0: nowhere.
     """
 
     base_color: Color
@@ -48,6 +50,8 @@ class Principled(NamedTuple):
     clearcoat_gloss: Float
     anisotropic: Float = 0.0
     flatness: Float = 0.0
+    fade: Float = 0.0
+    fade_width: Float = 0.0
 
 
 class Geometry(NamedTuple):
@@ -184,6 +188,12 @@ def spec_fresnel(p: Principled, cos: Float, weight: Float) -> Terms:
     return Terms(f0 * (1.0 - weight), white)
 
 
+def faded(p: Principled, cos_h: Float) -> Float:
+    """Share that is left for a half vector at this cosine to the normal: a smooth step, 1/2 at `fade`."""
+    t = ops.clip((cos_h - p.fade) / ops.maximum(p.fade_width, 1e-6) + 0.5, 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
 def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     """Value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe would be sampled."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
@@ -198,8 +208,9 @@ def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     # Every lobe is the base colour times one number plus another.
     diffuse = diffuse_terms(p, g)
     fresnel = spec_fresnel(p, g.cos_d, g.weight_d)
-    colored = diffuse.colored + spec * fresnel.colored
-    white = diffuse.white + spec * fresnel.white + clearcoat
+    left = faded(p, g.h.z)
+    colored = left * (diffuse.colored + spec * fresnel.colored)
+    white = left * (diffuse.white + spec * fresnel.white + clearcoat)
     return Lobes(p.base_color * colored + white, g.wo.z * ops.INV_PI, spec_pdf, clearcoat_pdf)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, Queue
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,12 @@ class Batch(NamedTuple):
 
     columns: NDArray[np.float32]  # (parameters, rows)
     mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs, anywhere in the row
+    phi: NDArray[np.float32]  # (rows,) azimuth of wi there, 0 for isotropic tables
     i: NDArray[np.float32]  # (rows,) bin of cos(theta_i)
+    a: NDArray[np.float32]  # (rows,) bin of phi, 0 for isotropic tables
     o: NDArray[np.float32]  # (bins_per_row, rows)
     p: NDArray[np.float32]  # (bins_per_row, rows)
-    shift: NDArray[np.float32]  # (3, bins_per_row, rows) random shift of the points' lattice
+    shift: NDArray[np.float32]  # (3 or 4, bins_per_row, rows) random shift of the points' lattice
     weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, undoes the choice of bins
     value: NDArray[np.float32]  # (3, bins_per_row, rows) the table
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at `mu`
@@ -43,21 +45,29 @@ class Pool:
     params: NDArray[np.float32]
     values: NDArray[np.floating]
     walks: NDArray[np.int64]
-    albedo: NDArray[np.float32]  # (materials, theta_i, 3)
+    albedo: NDArray[np.float32]  # (materials, theta_i[, phi_i], 3)
     grid: Grid = ISOTROPIC
 
     @staticmethod
     def of(tables: Tables) -> Pool:
         albedo = tables.albedo().astype(np.float32)
-        return Pool(tables.params.astype(np.float32), tables.values, tables.walks, albedo)
+        return Pool(tables.params.astype(np.float32), tables.values, tables.walks, albedo, tables.grid)
 
-    def albedo_at(self, m: NDArray, i: NDArray, mu: NDArray) -> NDArray:
-        """Directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i`: linear within a row, with the
-        slope between its neighbours and the row's own mean."""
+    def bins(self, m: NDArray, i: NDArray, a: NDArray, o: NDArray, p: NDArray) -> NDArray:
+        """Values (..., 3) of some bins; colours out of the gamut are moved there, as no BRDF is negative."""
+        rows = (m, i, a) if self.grid.phi_i else (m, i)
+        return np.maximum(self.values[(*rows, o, p)], 0.0)
+
+    def albedo_at(self, m: NDArray, i: NDArray, a: NDArray, mu: NDArray) -> NDArray:
+        """Directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i` (and `a`): linear within a row,
+        with the slope between its neighbours and the row's own mean."""
         last = self.grid.theta_i - 1
         above, below = np.minimum(i + 1, last), np.maximum(i - 1, 0)
-        slope = (self.albedo[m, above] - self.albedo[m, below]) / (above - below)[:, None]
-        return self.albedo[m, i] + slope * (mu * self.grid.theta_i - i - 0.5)[:, None]
+        around = (a,) if self.grid.phi_i else ()
+        slope = (self.albedo[(m, above, *around)] - self.albedo[(m, below, *around)]) / (above - below)[
+            :, None
+        ]
+        return self.albedo[(m, i, *around)] + slope * (mu * self.grid.theta_i - i - 0.5)[:, None]
 
 
 class Stream:
@@ -101,25 +111,40 @@ class BinSampler:
         steps = np.arange(grid.theta_o)
         near_o = 1.0 / (1.0 + ((steps[None, :] - steps[:, None]) / 1.5) ** 2)
         self._o = near_o / near_o.sum(axis=1, keepdims=True)
-        near_p = 1.0 / (1.0 + ((grid.phi_o - 1 - np.arange(grid.phi_o)) / 1.5) ** 2)
+        # Bins from the mirror direction's: folded tables have that last, others on both sides of it.
+        steps = np.arange(grid.phi_o)
+        steps = np.minimum(steps, grid.phi_o - steps) if grid.phi_i else grid.phi_o - 1 - steps
+        near_p = 1.0 / (1.0 + (steps / 1.5) ** 2)
         self._p = near_p / near_p.sum()
         self._cdf_o = np.cumsum(self._o, axis=1)
         self._cdf_p = np.cumsum(self._p)
 
-    def draw(self, rng: np.random.Generator, i: NDArray, count: int) -> tuple[NDArray, NDArray, NDArray]:
-        """(o, p, weight), each (count, rows), for the rows' bins `i` (rows,)."""
+    def draw(
+        self, rng: np.random.Generator, i: NDArray, a: NDArray, count: int
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """(o, p, weight), each (count, rows), for the rows' bins `i` and `a` (rows,)."""
         u = rng.random((2, count, len(i)))
         o = (u[0] * self.grid.theta_o).astype(np.int64)
         p = (u[1] * self.grid.phi_o).astype(np.int64)
         split = round(count * self.uniform_share)
-        near = np.broadcast_to(i, (count - split, len(i)))
+        near = np.broadcast_to(self._mirror_o(i), (count - split, len(i)))
         o[split:] = (u[0, split:, :, None] > self._cdf_o[near]).sum(axis=-1)
         p[split:] = np.searchsorted(self._cdf_p, u[1, split:])
         o, p = np.minimum(o, self.grid.theta_o - 1), np.minimum(p, self.grid.phi_o - 1)
         bins = self.grid.theta_o * self.grid.phi_o
         share = split / count
-        density = share / bins + (1.0 - share) * self._o[i[None, :], o] * self._p[p]
+        density = share / bins + (1.0 - share) * self._o[self._mirror_o(i)[None, :], o] * self._p[p]
+        if self.grid.phi_i:
+            p = (p + self._mirror_p(a)) % self.grid.phi_o
         return o, p, 1.0 / (bins * density)
+
+    def _mirror_o(self, i: NDArray) -> NDArray:
+        """The bin of theta_o with the mirror direction of the middle of bin `i`."""
+        return (2 * i + 1) * self.grid.theta_o // (2 * self.grid.theta_i)
+
+    def _mirror_p(self, a: NDArray) -> NDArray:
+        """The bin of phi_o with the mirror direction of the middle of bin `a`."""
+        return (2 * a + 1) * self.grid.phi_o // (2 * self.grid.phi_i) + self.grid.phi_o // 2
 
 
 def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
@@ -127,25 +152,31 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
     rng = np.random.default_rng((recipe.seed, step, 0xB17))
     m = rng.integers(len(pool.params), size=recipe.rows)
     i = rng.integers(pool.grid.theta_i, size=recipe.rows)
-    o, p, weight = sampler.draw(rng, i, recipe.bins_per_row)
+    a = rng.integers(pool.grid.phi_i, size=recipe.rows) if pool.grid.phi_i else np.zeros_like(i)
+    o, p, weight = sampler.draw(rng, i, a, recipe.bins_per_row)
     mu = (i + rng.random(recipe.rows)) / pool.grid.theta_i
+    phi = 0.0 * mu
+    if pool.grid.phi_i:
+        phi = (a + rng.random(recipe.rows)) * (2.0 * np.pi / pool.grid.phi_i)
     f32 = np.float32
     return Batch(
         np.ascontiguousarray(pool.params[m].T),
         mu.astype(f32),
+        phi.astype(f32),
         i.astype(f32),
+        a.astype(f32),
         o.astype(f32),
         p.astype(f32),
-        rng.random((3, *o.shape), dtype=f32),
+        rng.random((4 if pool.grid.phi_i else 3, *o.shape), dtype=f32),
         weight.astype(f32),
-        np.moveaxis(pool.values[m, i, o, p], -1, 0).astype(f32),
-        pool.albedo_at(m, i, mu).T.astype(f32),
+        np.moveaxis(pool.bins(m, i, a, o, p), -1, 0).astype(f32),
+        pool.albedo_at(m, i, a, mu).T.astype(f32),
         rng.random((3, 2, recipe.rows), dtype=f32),
-        (pool.grid.theta_i / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
+        (pool.grid.rows / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
     )
 
 
-def batches(source: Callable[[int], Batch], start: int, stop: int, group: int) -> Iterator[tuple[int, Batch]]:
+def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> Iterator[tuple[int, Any]]:
     """(first step, `group` steps stacked) from `start` to `stop`, prepared by a thread ahead of their use."""
     queue: Queue = Queue(maxsize=2)
     stopped = threading.Event()
@@ -154,7 +185,8 @@ def batches(source: Callable[[int], Batch], start: int, stop: int, group: int) -
         try:
             for first in range(start, stop, group):
                 steps = [source(s) for s in range(first, min(first + group, stop))]
-                queue.put((first, Batch(*(np.stack(parts) for parts in zip(*steps, strict=True)))))
+                stacked = type(steps[0])(*(np.stack(parts) for parts in zip(*steps, strict=True)))
+                queue.put((first, stacked))
                 if stopped.is_set():
                     return
             queue.put(None)

@@ -1,6 +1,11 @@
-"""The loss of a batch: Average-vs-Average (paper eq. 6) in the log domain (eq. 7)."""
+"""The loss of a batch: Average-vs-Average (paper eq. 6) in the log domain (eq. 7).
+
+What concerns rows alone takes batches of points (`nma.train.points`), too.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +20,16 @@ from nma.train.recipe import Recipe
 _TOLERANCE = 0.003
 
 
-def network_outputs(layers: Layers, batch: Batch, recipe: Recipe) -> jax.Array:
+def network_outputs(layers: Layers, batch: Any, recipe: Recipe) -> jax.Array:
     """(rows, numbers of the target), one pass of the network per row, at its cosine `mu`."""
-    inputs = encoding.get(recipe.encoding)(list(batch.columns), batch.mu if recipe.directional else None)
+    wi = view(batch)
+    inputs = encoding.get(recipe.encoding)(
+        list(batch.columns), wi.z if recipe.directional else None, (wi.x, wi.y)
+    )
     return network.forward(layers, jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1))
 
 
-def blend_of(layers: Layers, batch: Batch, recipe: Recipe) -> target.Blend:
+def blend_of(layers: Layers, batch: Any, recipe: Recipe) -> target.Blend:
     """The target of each row, (rows,)."""
     raw = network_outputs(layers, batch, recipe)
     blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
@@ -35,26 +43,47 @@ def bin_means(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:
     return jnp.stack([(c * points.weight).mean(axis=0) for c in value])
 
 
+def view(batch: Any) -> Vec3:
+    """wi of each row, (rows,)."""
+    sin = jnp.sqrt(1.0 - batch.mu * batch.mu)
+    return Vec3(sin * jnp.cos(batch.phi), sin * jnp.sin(batch.phi), batch.mu)
+
+
 def _points(batch: Batch, recipe: Recipe) -> ava.Points:
     """Points (points, bins_per_row, rows) of every bin."""
+    if len(batch.shift) == 4:
+        return _anisotropic_points(batch, recipe)
     if recipe.points_law == "centre":
         middle = (0.5 + 0.0 * batch.shift)[:, None]
-        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(middle))
+        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(middle), recipe.grid)
     lattice = jnp.asarray(ava.lattice(recipe.points), jnp.float32).T[:, :, None, None]
     u = (lattice + batch.shift[:, None]) % 1.0
     if recipe.points_law == "uniform":
-        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(u))
-    return ava.bin_points(batch.i, batch.o, batch.p, tuple(u), finest=recipe.finest)
+        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(u), recipe.grid)
+    return ava.bin_points(batch.i, batch.o, batch.p, tuple(u), recipe.grid, recipe.finest)
 
 
-def albedos(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:
+def _anisotropic_points(batch: Batch, recipe: Recipe) -> ava.Points:
+    place = (batch.i, batch.a, batch.o, batch.p)
+    grid = recipe.grid
+    if recipe.points_law == "centre":
+        middle = (0.5 + 0.0 * batch.shift)[:, None]
+        return ava.uniform_anisotropic_bin_points(*place, tuple(middle), grid)
+    lattice = jnp.asarray(ava.lattice(recipe.points, 4), jnp.float32).T[:, :, None, None]
+    u = tuple((lattice + batch.shift[:, None]) % 1.0)
+    if recipe.points_law == "uniform":
+        return ava.uniform_anisotropic_bin_points(*place, u, grid)
+    return ava.anisotropic_bin_points(*place, u, grid, recipe.finest)
+
+
+def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
     """Two independent unbiased estimates of the target's directional albedo, (2, 3, rows), from its own samples.
 
     The samples are held fixed while the target changes, so that derivatives are unbiased too, and none is clipped.
     """
     lattice = jnp.asarray(ava.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
-    wi = Vec3(jnp.sqrt(1.0 - batch.mu * batch.mu), 0.0 * batch.mu, batch.mu)
+    wi = view(batch)
     wo, _, pdf = target.sample(jax.lax.stop_gradient(blend), wi, *u)
     value = target.eval(blend, wi, wo)
     weight = jnp.where(pdf > 0, 1.0 / jnp.maximum(pdf, 1e-9), 0.0)
@@ -65,11 +94,16 @@ def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.A
     """(what is minimised, the log loss of eq. 7 against the noisy tables)."""
     blend = blend_of(layers, batch, recipe)
     total, log_loss = distance(bin_means(blend, batch, recipe), batch, recipe)
-    if recipe.albedo > 0:
-        # The product of two independent errors has the squared error as its mean, without the estimate's variance.
-        first, second = albedos(blend, batch, recipe) - batch.albedo
-        total = total + recipe.albedo * (first * second).mean()
-    return total, log_loss
+    return total + albedo_loss(blend, batch, recipe), log_loss
+
+
+def albedo_loss(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array | float:
+    """The recipe's weight of the squared error of the directional albedo, times that."""
+    if not recipe.albedo > 0:
+        return 0.0
+    # The product of two independent errors has the squared error as its mean, without the estimate's variance.
+    first, second = albedos(blend, batch, recipe) - batch.albedo
+    return recipe.albedo * (first * second).mean()
 
 
 def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:

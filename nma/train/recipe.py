@@ -7,6 +7,7 @@ from typing import Literal, get_args, get_origin, get_type_hints
 
 from nma.ava import FINEST
 from nma.errors import NmaError
+from nma.table import ISOTROPIC, Grid
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,10 @@ class Recipe:
     A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, with one network pass per
     row, and averages the target over `points` points per bin.
 
-    - `target`: "principled", the paper's 11 numbers per instance, or "stretched", one more that stretches the specular
-      lobe along the plane of incidence.
+    - `target`: "principled", the paper's 11 numbers per instance; "stretched", one more that stretches the specular
+      lobe along the plane of incidence; "measured", three more that fade it out, and flatten the diffuse lobe; or
+      "anisotropic", the same with lobes that are stretched along the surface's own axes.
+    - `grid`: the resolution of the tables.
     - `bounded`: dim the target where it might reflect more light than it receives; directional ones only.
     - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
       one point in the middle of the bin (point supervision).
@@ -34,7 +37,7 @@ class Recipe:
     network: str = "5x64"
     instances: int = 2
     directional: bool = True
-    target: Literal["principled", "stretched"] = "principled"
+    target: Literal["principled", "stretched", "measured", "anisotropic"] = "principled"
     bounded: bool = True
     encoding: str = "layered3"
     rows: int = 512
@@ -52,6 +55,7 @@ class Recipe:
     average: float = 0.999
     steps: int = 150_000
     seed: int = 0
+    grid: Grid = ISOTROPIC
 
     def __post_init__(self) -> None:
         positive = (
@@ -64,10 +68,12 @@ class Recipe:
         for name, hint in get_type_hints(Recipe).items():
             if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
                 raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
-        if self.target == "stretched" and not self.directional:
+        if self.target in ("stretched", "measured") and not self.directional:
             raise NmaError(
                 "a target stretched in the plane of incidence follows the direction; use principled"
             )
+        if bool(self.grid.phi_i) != (self.target == "anisotropic"):
+            raise NmaError("anisotropic tables and an anisotropic target belong together")
         if not 0 <= self.average < 1:
             raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
 
@@ -114,7 +120,32 @@ SINGLE = Recipe(
     steps=6_000,
 )
 
-PRESETS = {"class": CLASS, "paper": PAPER, "single": SINGLE}
+# One material that has values without noise: measured, tabulated, or somebody else's BSDF.
+MEASURED = replace(
+    SINGLE,
+    target="measured",
+    rows=512,
+    bins_per_row=64,
+    points=1,
+    albedo_samples=4,
+    loss="log",
+    schedule="onecycle",
+    learning_rate=7e-3,
+    average=0.0,
+    steps=10_000,
+)
+# The same where it matters how the material is turned.
+ANISOTROPIC = replace(
+    MEASURED, encoding="azimuth", target="anisotropic", grid=Grid(theta_i=20, theta_o=20, phi_o=40, phi_i=40)
+)
+
+PRESETS = {
+    "class": CLASS,
+    "paper": PAPER,
+    "single": SINGLE,
+    "measured": MEASURED,
+    "anisotropic": ANISOTROPIC,
+}
 
 
 def preset(name: str, **changes) -> Recipe:

@@ -33,6 +33,8 @@ struct Principled {
     T clearcoat_gloss;
     T anisotropic;
     T flatness;
+    T fade;
+    T fade_width;
 };
 
 // What every lobe of every instance needs to know about one pair of directions.
@@ -263,6 +265,13 @@ inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T weight) {
     return Terms<T>{f0 * (T(1.0) - weight), white};
 }
 
+// Share that is left for a half vector at this cosine to the normal: a smooth step, 1/2 at `fade`.
+template <class T>
+inline T faded(const Principled<T>& p, T cos_h) {
+    const auto t = clip((cos_h - p.fade) / maximum(p.fade_width, T(1e-06)) + T(0.5), T(0.0), T(1.0));
+    return t * t * (T(3.0) - T(2.0) * t);
+}
+
 // Value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe would be sampled.
 template <class T>
 inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
@@ -275,8 +284,9 @@ inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     const auto clearcoat = p.clearcoat * clearcoat_d * g.clearcoat;
     const auto diffuse = diffuse_terms<T>(p, g);
     const auto fresnel = spec_fresnel<T>(p, g.cos_d, g.weight_d);
-    const auto colored = diffuse.colored + spec * fresnel.colored;
-    const auto white = diffuse.white + spec * fresnel.white + clearcoat;
+    const auto left = faded<T>(p, g.h.z);
+    const auto colored = left * (diffuse.colored + spec * fresnel.colored);
+    const auto white = left * (diffuse.white + spec * fresnel.white + clearcoat);
     return Lobes<T>{p.base_color * colored + white, g.wo.z * INV_PI<T>, spec_pdf, clearcoat_pdf};
 }
 
@@ -321,7 +331,7 @@ inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
     return p.clearcoat * (fresnel * cos * cos * masking * masking + CLEARCOAT_MARGIN<T>);
 }
 
-// Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0.
+// Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0, and nothing fades.
 template <class T>
 inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
     const auto weight = schlick_weight<T>(cos_theta_i);

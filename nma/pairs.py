@@ -1,0 +1,56 @@
+"""How far one source is from another at random pairs of directions: the figures by which single materials are compared.
+
+cos(theta_i) and cos(theta_o) are independent and uniform in a range, azimuths are uniform. No bins, so that the figures
+hold for anisotropic sources and between models that were trained on different data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma import metrics
+from nma.jit import dr
+from nma.ops import Vec3
+from nma.sources.base import Values
+
+PAIRS = 20_000
+COSINES = (0.02, 1.0)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Cosines and azimuths, (n,) each."""
+
+    mu_i: NDArray[np.float64]
+    phi_i: NDArray[np.float64]
+    mu_o: NDArray[np.float64]
+    phi_o: NDArray[np.float64]
+
+    @staticmethod
+    def draw(count: int = PAIRS, *, seed: int = 0, cosines: tuple[float, float] = COSINES) -> Pairs:
+        """`count` pairs, determined by the seed."""
+        rng = np.random.default_rng((seed, 0x9A12))
+        mu_i, mu_o = rng.uniform(*cosines, (2, count))
+        phi_i, phi_o = rng.uniform(0.0, 2.0 * np.pi, (2, count))
+        return Pairs(mu_i, phi_i, mu_o, phi_o)
+
+    def values(self, source: Values) -> NDArray[np.float64]:
+        """f cos(theta_o) [1/sr] of a source, (n, 3)."""
+        value = source.eval(_direction(self.mu_i, self.phi_i), _direction(self.mu_o, self.phi_o))
+        return np.stack([np.broadcast_to(c.numpy(), len(self.mu_i)) for c in value], axis=-1).astype(
+            np.float64
+        )
+
+
+def compare(model: Values, reference: Values, pairs: Pairs | None = None) -> dict[str, float]:
+    """Log loss, AE and SMAPE of f cos(theta_o) (`nma.metrics`), means over pairs and RGB."""
+    pairs = pairs or Pairs.draw()
+    return metrics.value_metrics(pairs.values(model), pairs.values(reference))
+
+
+def _direction(mu: NDArray, phi: NDArray) -> Vec3:
+    sin = np.sqrt(1.0 - mu * mu)
+    return Vec3(*(dr.auto.Float(x.astype(np.float32)) for x in (sin * np.cos(phi), sin * np.sin(phi), mu)))

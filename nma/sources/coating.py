@@ -1,0 +1,85 @@
+"""A rough metal under a clear or tinted coat, in closed form: the analytic coating model of production renderers.
+
+Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces": the coat's own microfacet reflection, plus the
+metal's for the directions refracted at the mean surface, dimmed by both Fresnel transmittances and by absorption along
+both ways. Light that bounces between the layers is left out, so the model is darker than a simulation of the stack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nma import ops
+from nma.data import load_conductors
+from nma.errors import ParamError
+from nma.microfacet import fresnel_conductor_rgb, fresnel_dielectric, ggx_d, smith_g1
+from nma.ops import Color, Float, Vec3
+
+
+@dataclass(frozen=True)
+class Coating:
+    """The model (`Values`): a coat of index `eta` and width `alpha` over the metal `conductor` of width `alpha_metal`.
+
+    `absorption` is the coat's optical depth for light at normal incidence, per channel, at least 0. Widths are those of
+    GGX lobes, 1e-4 .. 1; `eta` is above 1. Raises `ParamError` for others, and for a metal that is not in the data.
+    """
+
+    conductor: str = "Au"
+    alpha_metal: float = 0.3
+    eta: float = 1.5
+    alpha: float = 0.05
+    absorption: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    name: str = "coating"
+
+    isotropic = True
+
+    def __post_init__(self) -> None:
+        if self.conductor not in load_conductors().names:
+            raise ParamError(f"coating: there is no conductor '{self.conductor}'; `Cu`, `Au`, `Al` are some")
+        for what in ("alpha", "alpha_metal"):
+            if not 1e-4 <= getattr(self, what) <= 1:
+                raise ParamError(f"coating: {what} is {getattr(self, what)}, allowed is 0.0001 .. 1")
+        if not self.eta > 1 or not all(0 <= a < np.inf for a in self.absorption):
+            raise ParamError(
+                f"coating: wants eta > 1 and absorption >= 0, got {self.eta} and {self.absorption}"
+            )
+
+    def eval(self, wi: Vec3, wo: Vec3) -> Color:
+        """f cos(theta_o) [1/sr]."""
+        metals = load_conductors()
+        row = metals.names.index(self.conductor)
+        n, k = (Color(*(index[row] / self.eta).tolist()) for index in (metals.eta, metals.k))
+        above = (wi.z > 1e-6) & (wo.z > 1e-6)
+        i, o = (Vec3(w.x, w.y, ops.select(above, w.z, 1.0)) for w in (wi, wo))
+        coat, fresnel = _lobe(i, o, self.alpha), fresnel_dielectric(_facing(i, o), self.eta)[0]
+        (inside_i, loss_i), (inside_o, loss_o) = (_refracted(w, self.eta) for w in (i, o))
+        metal = fresnel_conductor_rgb(_facing(inside_i, inside_o), n, k) * _lobe(
+            inside_i, inside_o, self.alpha_metal
+        )
+        path = 1.0 / inside_i.z + 1.0 / inside_o.z
+        # Refraction widens the beam inside, by eta^2 cos(inside) / cos(outside): f of the layer times the outer cosine.
+        through = (1.0 - loss_i) * (1.0 - loss_o) * o.z / (self.eta * self.eta * inside_o.z)
+        dimmed = Color(
+            *(c * through * ops.exp(-a * path) for c, a in zip(metal, self.absorption, strict=True))
+        )
+        return ops.select(above, dimmed + coat * fresnel, Color.of(0.0))
+
+
+def _facing(wi: Vec3, wo: Vec3) -> Float:
+    """Cosine between either direction and the half vector."""
+    h = wi + wo
+    return 0.5 * ops.sqrt(ops.dot(h, h))
+
+
+def _lobe(wi: Vec3, wo: Vec3, alpha: float) -> Float:
+    """A microfacet reflection without Fresnel, times cos(theta_o). Walter 2007, eq. 20, separable masking."""
+    h = ops.normalize(wi + wo)
+    return ggx_d(h, alpha, alpha) * smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha) / (4.0 * wi.z)
+
+
+def _refracted(w: Vec3, eta: float) -> tuple[Vec3, Float]:
+    """The direction beyond the mean surface, turned upwards again, and the share that does not get there."""
+    loss, cos_t = fresnel_dielectric(w.z, eta)
+    return Vec3(w.x / eta, w.y / eta, cos_t), loss

@@ -1,0 +1,145 @@
+"""Supervision by a source's own values at points: what sources that know them (`Values`) are fitted to.
+
+A table's bins have to be averaged over, as nothing else is known of them. Where values are known, every point of the
+target is compared with the source's at the same pair of directions, which needs an eighth of the evaluations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from nma import ava, ops, target
+from nma.errors import SourceError
+from nma.jit import dr
+from nma.microfacet import visible_normal_pdf
+from nma.ops import Vec3
+from nma.sources.base import Values
+from nma.target.sampling import sample_spec
+from nma.train.loss import albedo_loss, blend_of, view
+from nma.train.recipe import Recipe
+
+# View directions of the pool, and points wo of each: half of them uniform, half crowded around the mirror direction.
+ROWS, POINTS = 8192, 512
+# Widths of the microfacet lobes that the crowded half is drawn from.
+_WIDTHS = tuple(0.0005 * 2.0**k for k in range(11))
+# Rows that are evaluated at once: bounds the memory.
+_ROWS_PER_LAUNCH = 2048
+
+
+class PointBatch(NamedTuple):
+    """Points of one step; rows come last, as in `nma.train.data.Batch`."""
+
+    columns: NDArray[np.float32]  # (0, rows): a single material has no parameters
+    mu: NDArray[np.float32]  # (rows,) cos(theta_i)
+    phi: NDArray[np.float32]  # (rows,) azimuth of wi
+    wo: NDArray[np.float32]  # (3, points, rows)
+    weight: NDArray[np.float32]  # (points, rows) mean 1, undoes the crowding
+    value: NDArray[np.float32]  # (3, points, rows)
+    albedo: NDArray[np.float32]  # (3, rows) directional albedo at wi
+    albedo_shift: NDArray[np.float32]  # (3, 2, rows) random shifts of the samples that estimate the target's
+
+
+@dataclass
+class PointPool:
+    """Values of one source at many pairs of directions, (ROWS, POINTS)."""
+
+    mu: NDArray[np.float32]  # (ROWS,)
+    phi: NDArray[np.float32]  # (ROWS,)
+    wo: NDArray[np.float32]  # (3, ROWS, POINTS)
+    weight: NDArray[np.float32]  # (ROWS, POINTS)
+    value: NDArray[np.float32]  # (3, ROWS, POINTS)
+    albedo: NDArray[np.float32]  # (3, ROWS)
+
+    @staticmethod
+    def of(source: Values, *, seed: int = 0, rows: int = ROWS, points: int = POINTS) -> PointPool:
+        """Determined by the seed. Colours out of the gamut are moved there, as no BRDF is negative.
+
+        Raises `SourceError` for values that are not finite.
+        """
+        rng = np.random.default_rng((seed, 0x9017))
+        # Every row has a stratum of cos(theta_i) to itself.
+        mu = (rng.permutation(rows) + rng.random(rows)) / rows
+        phi = np.zeros(rows) if source.isotropic else rng.uniform(0.0, 2.0 * math.pi, rows)
+        shift = rng.random((3, rows))
+        launches = [slice(first, first + _ROWS_PER_LAUNCH) for first in range(0, rows, _ROWS_PER_LAUNCH)]
+        parts = [_evaluated(source, mu[part], phi[part], shift[:, part], points) for part in launches]
+        wo, weight, value = (np.concatenate(arrays, axis=-2) for arrays in zip(*parts, strict=True))
+        if not np.isfinite(value).all():
+            row = int(np.argwhere(~np.isfinite(value).all(axis=(0, 2)))[0, 0])
+            raise SourceError(
+                f"{source.name}: has values that are not finite, first at cos(theta_i) = {mu[row]:.4f}"
+            )
+        value = np.maximum(value, 0.0)
+        albedo = 2.0 * math.pi * (value * weight).mean(axis=-1)
+        return PointPool(*(x.astype(np.float32) for x in (mu, phi, wo, weight, value, albedo)))
+
+    def draw(self, recipe: Recipe, step: int) -> PointBatch:
+        """The points of one step: random rows, and in each a random share of its points."""
+        rng = np.random.default_rng((recipe.seed, step, 0x90))
+        m = rng.integers(len(self.mu), size=recipe.rows)
+        # Strides keep uniform and crowded points in balance: they alternate.
+        count = recipe.bins_per_row * recipe.points
+        k = (
+            rng.integers(self.weight.shape[1], size=recipe.rows) + np.arange(count)[:, None]
+        ) % self.weight.shape[1]
+        return PointBatch(
+            np.zeros((0, recipe.rows), np.float32),
+            self.mu[m],
+            self.phi[m],
+            self.wo[:, m, k],
+            self.weight[m, k],
+            self.value[:, m, k],
+            self.albedo[:, m],
+            rng.random((3, 2, recipe.rows), dtype=np.float32),
+        )
+
+
+def _evaluated(
+    source: Values, mu: NDArray, phi: NDArray, shift: NDArray, points: int
+) -> tuple[NDArray, NDArray, NDArray]:
+    """(wo (3, rows, points), weight (rows, points), value (3, rows, points)) for some rows."""
+    Float = dr.auto.Float
+
+    def lanes(x: NDArray) -> Any:
+        return Float(np.ascontiguousarray(np.broadcast_to(x, (len(mu), points)), np.float32).ravel())
+
+    u = [lanes((x + s[:, None]) % 1.0) for x, s in zip(ava.lattice(points).T, shift, strict=True)]
+    sin = np.sqrt(1.0 - mu * mu)
+    wi = Vec3(*(lanes(c[:, None]) for c in (sin * np.cos(phi), sin * np.sin(phi), mu)))
+    wo, weight = _directions(wi, u, lanes(np.arange(points)[None] % 2))
+    value = source.eval(wi, wo)
+    arrays = [np.stack([c.numpy() for c in triple]) for triple in (wo, value)]
+    shape = (len(mu), points)
+    return arrays[0].reshape(3, *shape), weight.numpy().reshape(shape), arrays[1].reshape(3, *shape)
+
+
+def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
+    """wo from uniform numbers, uniform over the hemisphere or, where `crowded` is 1, around the mirror direction; and
+    the density of uniform directions over that of the mixture of both, 0 below the horizon."""
+    turn = (2.0 * math.pi) * u[0]
+    across = ops.safe_sqrt(1.0 - u[1] * u[1])
+    uniform = Vec3(across * dr.cos(turn), across * dr.sin(turn), u[1])
+    width = _WIDTHS[0] * ops.exp(dr.floor(u[2] * len(_WIDTHS)) * math.log(2.0))
+    wo = ops.select(crowded > 0, sample_spec(wi, width, width, u[0], u[1]), uniform)
+    h = wi + wo
+    h = h * (1.0 / ops.maximum(ops.sqrt(ops.dot(h, h)), 1e-9))
+    facing = 4.0 * ops.maximum(ops.dot(wi, h), 1e-9)
+    lobes = sum(visible_normal_pdf(wi, h, a, a) for a in _WIDTHS) / (facing * len(_WIDTHS))
+    density = 0.5 / (2.0 * math.pi) + 0.5 * lobes
+    return wo, ops.select(wo.z > 0, 1.0 / (2.0 * math.pi * density), 0.0)
+
+
+def points_loss(layers: Any, batch: PointBatch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """(what is minimised, the log loss of eq. 7 at the points). For `nma.train.loop`, in place of the loss of bins."""
+    blend = blend_of(layers, batch, recipe)
+    value = jnp.stack(list(target.eval(blend, view(batch), Vec3(*batch.wo))))
+    log_loss = (jnp.abs(jnp.log1p(value) - jnp.log1p(batch.value)) * batch.weight).mean()
+    energy = (jnp.abs(value - batch.value) * batch.weight).mean()
+    return log_loss + recipe.energy * energy + albedo_loss(blend, batch, recipe), log_loss
