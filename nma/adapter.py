@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma import encoding, network, ops, weights
+from nma.encoding import Tangent
 from nma.errors import WeightsError
 from nma.network import Layers
 from nma.ops import Float
@@ -150,7 +151,7 @@ class Adapter:
         columns: Sequence[Float],
         cos_theta_i: Float,
         active: Any = True,
-        tangent: encoding.Tangent | None = None,
+        tangent: Tangent | None = None,
     ) -> Blend:
         """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,).
 

@@ -18,7 +18,7 @@ from nma.params import LAYERED3, ParamSpace
 Tangent = tuple[Float, Float]
 # Takes one array per parameter column; cos(theta_i), or None for an adapter whose parameters ignore the direction; and
 # the rest of the direction, which anisotropic encodings need.
-Encoder = Callable[[Sequence[Float], Float | None, Tangent | None], list[Float]]
+Encoder = Callable[..., list[Float]]
 
 # Cosine of 84 degrees: where the reflectance of metals dips before it rises to 1.
 _GRAZING = 0.1045

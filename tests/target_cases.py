@@ -9,8 +9,8 @@ from nma.target import Blend, Principled
 def random_principled(
     rng: np.random.Generator, n: int, dialect: bool = True, fades: bool = False
 ) -> Principled:
-    """(n,) sets: widths spread over decades, pure cases frequent; `dialect` adds what the paper leaves out, `fades` what
-    Mitsuba's BSDF does not have."""
+    """(n,) sets: widths spread over decades, pure cases frequent; `dialect` adds what the paper leaves out, `fades`
+    what Mitsuba's BSDF does not have."""
 
     def often_pure():
         u = rng.random(n)

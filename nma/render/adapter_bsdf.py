@@ -2,7 +2,8 @@
 
 The network maps source parameters and cos(theta_i) to the blend; value, density and sampling are those of the blend.
 Without textures it runs when the scene is loaded, into curves over cos(theta_i); with textures, and for anisotropic
-adapters, at every shading point, once for all that a path tracer asks there. Inputs: `nma.render.inputs`. One-sided; wrap it in `twosided` if needed.
+adapters, at every shading point, once for all that a path tracer asks there. Inputs: `nma.render.inputs`. One-sided;
+wrap it in `twosided` if needed.
 
 Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond its training
 range are moved there instead of refused; and the parameters of the adapter's class, or a `material` that has them.

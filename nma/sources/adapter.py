@@ -11,7 +11,7 @@ from nma.target import Plane
 
 
 class AdapterValues:
-    """One material of an adapter (`Values`), whose parameters are `params`, none for an adapter of a single material."""
+    """One material of an adapter (`Values`), of parameters `params`; an adapter of a single material has none."""
 
     def __init__(self, adapter: Adapter, params: Sequence[Float] = (), name: str = "adapter"):
         self.adapter, self.name = adapter, name

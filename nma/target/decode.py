@@ -71,8 +71,8 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
 # twice, say. The width along the plane is 1/6.4 to 6.9 times that across it.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
-# What measured materials need besides. RGL's, say, are zero where the half vector is tilted by more than about 70 degrees:
-# the instrument does not reach there. A wide fade shapes the diffuse lobe.
+# What measured materials need besides. RGL's, say, are zero where the half vector is tilted by more than about 70
+# degrees: the instrument does not reach there. A wide fade shapes the diffuse lobe.
 MEASURED_PARAMS = (
     *STRETCHED_PARAMS,
     TargetParam("flatness"),

@@ -10,7 +10,7 @@ Deliberate differences from Mitsuba's plugin, all of them small:
 - The cosine between a direction and the half vector is |wi + wo| / 2, the same for both directions. Mitsuba takes the
   dot product of `wi`, which rounding spoils where the directions are nearly opposite: both grazing, forward.
 - Tints divide by max(luminance, 1e-6), so they fade for colours darker than that instead of switching to white at zero.
-- Instances may fade out towards grazing half vectors (`fade`), where measurements end; Mitsuba's have no such parameter.
+- Instances may fade out towards grazing half vectors (`fade`), where measurements end; Mitsuba's do not.
 - Directions within 1e-9 of the horizon are invalid, as are those below it (no back side).
 - Lobes are chosen by their estimated albedo, and one density covers the whole blend (`nma.target.blend`).
 
