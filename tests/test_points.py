@@ -9,19 +9,22 @@ from source_cases import LAMBERT, Formula, direction
 
 from nma import ops
 from nma.adapter import Adapter
-from nma.errors import NmaError, ParamError, SourceError
+from nma.errors import NmaError, ParamError, SourceError, TableError
 from nma.ops import Color, Vec3
 from nma.pairs import Pairs, compare
 from nma.sources.adapter import AdapterValues
 from nma.sources.coating import Coating
 from nma.sources.mitsuba_bsdf import from_dict
+from nma.table import Grid, Tables
+from nma.tabulation import tabulate_values
 from nma.target import Principled, eval_principled
 from nma.train import recipe as recipes
+from nma.train.fit import fit, recipe_for
 from nma.train.points import PointPool
-from nma.train.run import fit_values
 
 import mitsuba as mi  # isort: skip
 
+SMALL = Grid(4, 5, 6)
 PLASTIC = Principled(Color(0.6, 0.3, 0.1), 0.4, 0.0, 1.0, 0.0, 0.2, 0.5, 0.3, 0.8)
 QUICK = replace(recipes.MEASURED, network="1x16", rows=64, bins_per_row=32, steps=400, albedo=0.0)
 BRUSHED = {"type": "roughconductor", "material": "Au", "distribution": "ggx", "alpha_u": 0.1, "alpha_v": 0.4}
@@ -80,7 +83,7 @@ def test_values_out_of_the_gamut_are_moved_there_and_others_refused():
 def test_a_fit_finds_a_principled_brdf():
     """One layer of 16 and 400 steps are enough where the target can be the source."""
     source = Formula(lambda wi, wo: eval_principled(PLASTIC, wi, wo), name="plastic")
-    adapter, run = fit_values(source, QUICK, {"data": "test"})
+    adapter, run = fit(source, QUICK, {"data": "test"})
     found = compare(AdapterValues(adapter), source, Pairs.draw(4000))
     assert found["log_loss"] < 0.005
     assert found["log_loss"] < 0.2 * compare(LAMBERT, source, Pairs.draw(4000))["log_loss"]
@@ -91,7 +94,7 @@ def test_an_anisotropic_fit_knows_azimuths(tmp_path):
     source = from_dict(BRUSHED)
     assert not source.isotropic
     recipe = replace(recipes.ANISOTROPIC, network="1x32", rows=128, bins_per_row=32, steps=600, albedo=0.0)
-    adapter, _ = fit_values(source, recipe, {})
+    adapter, _ = fit(source, recipe, {})
     adapter.save(tmp_path / "brushed.safetensors")
     loaded = AdapterValues(Adapter.load(tmp_path / "brushed.safetensors"))
     assert not loaded.isotropic
@@ -102,6 +105,25 @@ def test_an_anisotropic_fit_knows_azimuths(tmp_path):
     assert found < 0.2 * compare(loaded, turned, pairs)["log_loss"]
 
 
+@pytest.mark.parametrize(
+    "grid", (Grid(10, 10, 10), Grid(8, 8, 16, phi_i=8)), ids=("isotropic", "anisotropic")
+)
+def test_tables_are_fitted_bin_by_bin(grid):
+    """Tables without parameters, of any resolution."""
+    source = from_dict({**BRUSHED, "alpha_u": 0.4} if not grid.phi_i else BRUSHED)
+    tables = tabulate_values(source, grid=grid)
+    changes = {"network": "1x32", "rows": 64, "points": 4, "steps": 300, "albedo": 0.0, "finest": 0.01}
+    adapter, _ = fit(tables, recipe_for(tables, **changes))
+    found = compare(AdapterValues(adapter), source, Pairs.draw(4000))["log_loss"]
+    assert found < 0.3 * compare(LAMBERT, source, Pairs.draw(4000))["log_loss"]
+
+
+def test_several_materials_are_no_table_of_one():
+    tables = tabulate_values(LAMBERT, grid=SMALL)
+    with pytest.raises(TableError, match="a fit is for one material, the table has 2"):
+        fit(Tables.concatenate([tables, tables]))
+
+
 def _quarter(w):
     """The direction after a quarter of a turn about the normal."""
     return Vec3(-w.y, w.x, w.z)
@@ -109,7 +131,9 @@ def _quarter(w):
 
 def test_recipes_and_sources_must_agree_on_isotropy():
     with pytest.raises(NmaError, match="BSDF 'roughconductor' is anisotropic; take a recipe for such"):
-        fit_values(from_dict(BRUSHED), QUICK, {})
+        fit(from_dict(BRUSHED), QUICK, {})
+    with pytest.raises(NmaError, match="the table is isotropic; take a recipe for such"):
+        fit(tabulate_values(LAMBERT, grid=SMALL), recipes.ANISOTROPIC)
     with pytest.raises(NmaError, match="anisotropic tables and an anisotropic target belong together"):
         replace(recipes.MEASURED, target="anisotropic")
 

@@ -124,6 +124,8 @@ SINGLE = Recipe(
 MEASURED = replace(
     SINGLE,
     target="measured",
+    # The bound knows nothing of the fade, and would dim what is bright and fades.
+    bounded=False,
     rows=512,
     bins_per_row=64,
     points=1,

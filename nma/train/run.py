@@ -17,16 +17,13 @@ import nma
 from nma import encoding, network, target
 from nma.adapter import Adapter
 from nma.dataset import Settings
-from nma.errors import NmaError
 from nma.network import Layers
 from nma.ops import Color
-from nma.params import MEASURED, ParamSpace
-from nma.sources.base import Values
+from nma.params import ParamSpace
 from nma.table import Tables
 from nma.target import Blend, Principled
 from nma.train import loop
 from nma.train.data import BinSampler, Pool, Stream, draw
-from nma.train.points import PointPool, points_loss
 from nma.train.recipe import Recipe
 
 # Where training starts: a coloured rough metal under a sharp, colourless reflection.
@@ -80,7 +77,7 @@ def train_class(
         progress=progress,
         budget_seconds=budget_seconds,
     )
-    return _adapter(space, recipe, run, record), run
+    return adapter_of(space, recipe, run, record), run
 
 
 def _constant(pool: Pool) -> Callable[[int], Pool]:
@@ -102,35 +99,7 @@ def fit_material(
     return train_class(space, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
 
 
-def fit_values(
-    source: Values,
-    recipe: Recipe,
-    record: dict[str, Any],
-    *,
-    progress: Callable[[loop.Run], None] = lambda run: None,
-    budget_seconds: float = float("inf"),
-) -> tuple[Adapter, loop.Run]:
-    """Fits one material whose values are known: measured, a renderer's BSDF, anything with an `eval`.
-
-    Raises `NmaError` where the recipe is for isotropic materials and the source is not, or the other way round.
-    """
-    if source.isotropic == (recipe.target == "anisotropic"):
-        kind = "isotropic" if source.isotropic else "anisotropic"
-        raise NmaError(f"{source.name} is {kind}; take a recipe for such, by its target and encoding")
-    pool = PointPool.of(source, seed=recipe.seed)
-    run = loop.start(recipe, initial_layers(recipe, MEASURED), record)
-    loop.train(
-        recipe,
-        run,
-        lambda step: pool.draw(recipe, step),
-        objective=points_loss,
-        progress=progress,
-        budget_seconds=budget_seconds,
-    )
-    return _adapter(MEASURED, recipe, run, record), run
-
-
-def _adapter(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str, Any]) -> Adapter:
+def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str, Any]) -> Adapter:
     """The trained adapter with its record."""
     tail = run.log_losses[-1000:]
     training = {
