@@ -22,12 +22,16 @@ if TYPE_CHECKING:
     from nma.image_metrics import compare_images as compare_images
     from nma.materials import load as load_material  # noqa: F401
     from nma.materials import names as material_names  # noqa: F401
+    from nma.pairs import compare as compare_values  # noqa: F401
     from nma.params import LAYERED3 as LAYERED3
     from nma.params import ParamSpace as ParamSpace
     from nma.render.scene import preview_scene as preview_scene
     from nma.sources import get as source  # noqa: F401
+    from nma.sources import read as read_values  # noqa: F401
+    from nma.sources.adapter import AdapterValues as AdapterValues
     from nma.table import Tables as Tables
     from nma.table import tabulate as tabulate
+    from nma.train.fit import fit as fit
 
 _HOMES = {
     "Adapter": "nma.adapter",
@@ -38,14 +42,18 @@ _HOMES = {
     "evaluate_adapter": "nma.evaluate:evaluate",
     "tabulate_adapter": "nma.evaluate",
     "compare_images": "nma.image_metrics",
+    "compare_values": "nma.pairs:compare",
     "load_material": "nma.materials:load",
     "material_names": "nma.materials:names",
     "LAYERED3": "nma.params",
     "ParamSpace": "nma.params",
     "preview_scene": "nma.render.scene",
     "source": "nma.sources:get",
+    "read_values": "nma.sources:read",
+    "AdapterValues": "nma.sources.adapter",
     "Tables": "nma.table",
     "tabulate": "nma.table",
+    "fit": "nma.train.fit",
 }
 
 __all__ = [*_HOMES, "__version__"]
