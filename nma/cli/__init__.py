@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from nma.cli import data, datasets, learn, native, system, view
+from nma.cli import data, datasets, learn, native, principled, system, view
 from nma.errors import NmaError
 
 app = typer.Typer(
@@ -17,11 +17,11 @@ app = typer.Typer(
     help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs "
     "by a tiny network.\n\n"
     "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
-    "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], judge with [bold]evaluate[/bold] and "
+    "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], or [bold]principled[/bold], judge with [bold]evaluate[/bold] and "
     "[bold]compare[/bold], look with [bold]render[/bold]. [bold]data[/bold] lists measured materials, "
     "[bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
-for group in (data, datasets, learn, view, native, system):
+for group in (data, datasets, learn, principled, view, native, system):
     group.register(app)
 
 

@@ -92,7 +92,11 @@ def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
 
 def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
     """(what is minimised, the log loss of eq. 7 against the noisy tables)."""
-    blend = blend_of(layers, batch, recipe)
+    return blend_loss(blend_of(layers, batch, recipe), batch, recipe)
+
+
+def blend_loss(blend: target.Blend, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The same for a blend, of numbers that are constant or (rows,)."""
     total, log_loss = distance(bin_means(blend, batch, recipe), batch, recipe)
     return total + albedo_loss(blend, batch, recipe), log_loss
 

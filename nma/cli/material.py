@@ -1,0 +1,101 @@
+"""What a command's SOURCE means: any description of one material, turned into its table."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import typer
+
+from nma.cli import console
+from nma.errors import SourceError, TableError
+
+if TYPE_CHECKING:
+    from nma.table import Tables
+
+
+def tables_of(
+    source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
+) -> tuple[Tables, dict[str, Any]]:
+    """The isotropic table of one material, and the record of where it comes from.
+
+    `source` is a named material or a material file (.toml), which are simulated with so many `walks`; a file that
+    `nma.sources.read` understands, whose values are averaged over bins; or a reference file (.npz). `material` chooses
+    in a file that holds several: by name among NBRDF networks, by number in a reference file.
+
+    The record has `data`, the kind and name of the source, `material`, the material's name, and `walks_per_material` or
+    `points_per_bin`. Raises `NmaError` for what cannot be read, and for anisotropic materials.
+    """
+    from nma import materials
+
+    path = Path(source)
+    if path.suffix == ".npz":
+        return _reference(path, material) if _holds_tables(path) else _values(path, material)
+    if material is not None:
+        raise typer.BadParameter(f"--material chooses in .npz files; {source} is a single material")
+    if path.suffix in ("", ".toml") or source in materials.names():
+        return _simulated(source, walks, seed)
+    return _values(path, None)
+
+
+def _simulated(name: str, walks: int, seed: int) -> tuple[Tables, dict[str, Any]]:
+    from nma import materials, sources
+    from nma.table import stream_keys, tabulate
+
+    material = materials.load(name)
+    vector = material.vector()
+    began = time.perf_counter()
+    source = sources.get(material.class_name)
+    tables = tabulate(source, vector[None], walks, stream_keys(seed, range(1)), error=False)
+    console.err.print(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
+    record = {"data": f"material {name}", "material": material.name, "walks_per_material": walks}
+    return tables, record
+
+
+def _values(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]]:
+    from nma import sources
+    from nma.tabulation import POINTS, tabulate_values
+
+    values = sources.read(path, material)
+    if not values.isotropic:
+        raise SourceError(f"{path}: {values.name} is anisotropic, only isotropic materials can be fitted")
+    began = time.perf_counter()
+    tables = tabulate_values(values, points=POINTS)
+    console.err.print(f"tabulated {values.name} in {time.perf_counter() - began:.1f} s")
+    record = {"data": f"values of {path.name}", "material": material or path.stem, "points_per_bin": POINTS}
+    return tables, record
+
+
+def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]]:
+    from nma.table import Tables
+
+    tables = Tables.load(path)
+    number = _number(path, len(tables.values), material)
+    chosen = tables[number : number + 1]
+    record = {
+        "data": f"table of {path.name}",
+        "material": f"{path.stem} {number}" if len(tables.values) > 1 else path.stem,
+        "walks_per_material": int(chosen.walks[0]),
+    }
+    return chosen, record
+
+
+def _number(path: Path, count: int, material: str | None) -> int:
+    """Which of a reference file's materials is meant."""
+    if material is None and count == 1:
+        return 0
+    if material is None or not material.isdecimal() or int(material) >= count:
+        given = "" if material is None else f", not {material!r}"
+        raise TableError(f"{path}: holds {count} material(s); choose one with --material 0 .. {count - 1}{given}")
+    return int(material)
+
+
+def _holds_tables(path: Path) -> bool:
+    """Whether an .npz file is a reference file; those of NBRDF networks have other arrays."""
+    try:
+        with path.open("rb") as file, np.load(file) as f:
+            return "weights" not in f
+    except Exception:  # whoever reads it says what is wrong
+        return True

@@ -1,0 +1,82 @@
+"""`nma principled`: a material as one plain Principled BRDF, for renderers that have nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from nma.cli import console
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(principled)
+
+
+def principled(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="A named material, a material file (.toml), measured or other values (.binary, .bsdf, .xml, .npz), or "
+            "a reference file (.npz)."
+        ),
+    ],
+    material: Annotated[
+        str | None,
+        typer.Option(help="Which one of an .npz file: a network's name, or the number of a table, from 0."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors)."
+        ),
+    ] = None,
+    walks: Annotated[int, typer.Option(help="Walks of the table, if the material is simulated.")] = 16_000_000,
+    steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the walks and of the batches.")] = 0,
+) -> None:
+    """Fit the constant parameters of one plain Principled BRDF, and print them as a dictionary of Mitsuba's.
+
+    No network, no blend, no dependence on the direction: numbers for any renderer with such a BRDF.
+
+    Examples: [bold]nma principled gold-red-lacquer -o gold.xml[/bold],
+    [bold]nma principled paper_white_rgb.bsdf[/bold]
+    """
+    if output is not None and output.suffix not in (".xml", ".json", ".safetensors"):
+        raise typer.BadParameter(f"output {output} must end in .xml, .json or .safetensors")
+    from nma.cli.material import tables_of
+    from nma.export.mitsuba import principled_dict, principled_xml
+    from nma.train.constant import CONSTANT, fit_constant
+
+    tables, record = tables_of(source, material, walks, seed)
+    recipe = replace(CONSTANT, seed=seed, **({} if steps is None else {"steps": steps}))
+    with console.TrainingBar(recipe, "fitting") as bar:
+        fit = fit_constant(tables, recipe, record, progress=bar.update)
+    description = principled_dict(fit.principled)
+    print(_json(description))
+    console.err.print(
+        f"log loss {fit.log_loss:.5f} over the table, albedo error {fit.figures['albedo_error']:.4f}", highlight=False
+    )
+    if output is None:
+        return
+    if output.suffix == ".safetensors":
+        fit.adapter.save(output)
+    else:
+        _write(output, principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n")
+    console.err.print(f"wrote {output}", highlight=False)
+
+
+def _json(description: dict[str, Any]) -> str:
+    return json.dumps(description, indent=2)
+
+
+def _write(path: Path, text: str) -> None:
+    """Writes the file, atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)

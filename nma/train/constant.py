@@ -1,0 +1,157 @@
+"""The best constant parameters of one plain Principled BRDF for a material: no network, no direction, no blend."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+import nma
+from nma import target
+from nma.adapter import Adapter
+from nma.errors import TableError
+from nma.evaluate import evaluate, tabulate_adapter
+from nma.metrics import table_metrics
+from nma.ops import Color
+from nma.params import SPACES, ParamSpace
+from nma.table import ISOTROPIC, Tables
+from nma.target import PRINCIPLED_PARAMS, Blend, Principled, TargetParam
+from nma.train import loop
+from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.loss import blend_loss
+from nma.train.recipe import Recipe
+
+# The paper's 11 numbers and the fake subsurface. `anisotropic` stays 0: tables of isotropic materials do not know it.
+CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
+
+CONSTANT = Recipe(
+    network="none",
+    instances=1,
+    directional=False,
+    bounded=False,
+    encoding="direction",
+    rows=160,
+    bins_per_row=16,
+    points=4,
+    albedo=0.3,
+    albedo_samples=8,
+    learning_rate=0.05,
+    average=0.98,
+    steps=800,
+)
+
+# Where the fits start, as the problem has many local minima. The table says which base colour.
+_GREY = Color(0.5, 0.5, 0.5)
+_STARTS = {
+    "diffuse": Principled(_GREY, 0.6, 0.05, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
+    "glossy": Principled(_GREY, 0.15, 0.05, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
+    "coated": Principled(_GREY, 0.5, 0.5, 0.5, 0.1, 0.1, 0.5, 0.8, 0.8, flatness=0.1),
+    "rough metal": Principled(_GREY, 0.5, 0.95, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
+    "smooth metal": Principled(_GREY, 0.15, 0.95, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
+}
+
+# cos(theta_i) per row of the table that tell which fit is best.
+_DIRECTIONS = 8
+
+_MEASURED = ParamSpace("measured", ())
+
+
+class Constant(NamedTuple):
+    """Plain numbers, their log loss (eq. 7) and all other figures over the whole table, and the numbers as an adapter
+    that looks at nothing."""
+
+    principled: Principled
+    log_loss: float
+    figures: dict[str, float]
+    adapter: Adapter
+
+
+def fit_constant(
+    tables: Tables,
+    recipe: Recipe = CONSTANT,
+    record: dict[str, Any] | None = None,
+    *,
+    progress: Callable[[loop.Run], None] = lambda run: None,
+) -> Constant:
+    """Fits the isotropic table of one material from several starting points, and keeps the best.
+
+    `record` says where the table comes from and is stored with the adapter. Equal arguments give equal results on one
+    machine. Raises `TableError` for several materials and for tables of other bins.
+    """
+    if len(tables.values) != 1:
+        raise TableError(f"constant parameters describe one material, the table has {len(tables.values)}")
+    if tables.values.shape[1:] != ISOTROPIC.shape:
+        raise TableError(
+            f"constant parameters are fitted to isotropic tables {ISOTROPIC.shape}, "
+            f"this one has {tables.values.shape[1:]}"
+        )
+    pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
+    run = loop.start(recipe, _starts(tables))
+    loop.train(
+        recipe, run, lambda step: draw(pool, sampler, recipe, step), objective=_objective, progress=progress
+    )
+    record = {**(record or {}), **_record(tables, recipe, run)}
+    fits = {
+        start: _adapter(tables, raw, {**record, "start": start})
+        for start, raw in zip(_STARTS, loop.result(run, recipe), strict=True)
+    }
+    judged = {start: _rough_log_loss(adapter, tables) for start, adapter in fits.items()}
+    adapter = fits[min(judged, key=lambda start: judged[start])]
+    figures = evaluate(adapter, tables).mean
+    adapter.training.update({"log_loss": figures["log_loss"], "log_loss_of_starts": judged})
+    return Constant(_plain(adapter), figures["log_loss"], figures, adapter)
+
+
+def _starts(tables: Tables) -> NDArray[np.float32]:
+    """Raw numbers (starts, numbers of the target), whose base colour is the table's mean albedo."""
+    base_color = Color(*np.clip(tables.albedo()[0].mean(axis=0), 0.02, 0.98))
+    blends = [Blend((p._replace(base_color=base_color),), (1.0,)) for p in _STARTS.values()]
+    return np.array([target.encode(b, CONSTANT_PARAMS) for b in blends], np.float32)
+
+
+def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The sum over all fits, as none knows of the others, and the log loss of the best."""
+
+    def one(numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return blend_loss(target.decode(list(numbers), 1, CONSTANT_PARAMS), batch, recipe)
+
+    totals, log_losses = jax.vmap(one)(raw)
+    return totals.sum(), log_losses.min()
+
+
+def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -> Adapter:
+    """An adapter whose network is its output's bias alone."""
+    size = tables.params.shape[1]
+    space = next((s for s in SPACES.values() if s.size == size), _MEASURED)
+    layers = [(np.zeros((len(raw), 1), np.float32), np.asarray(raw, np.float32))]
+    return Adapter(space, "direction", layers, 1, False, CONSTANT_PARAMS, record)
+
+
+def _rough_log_loss(adapter: Adapter, tables: Tables) -> float:
+    """The log loss over the whole table, from fewer points than `evaluate` takes."""
+    mean = tabulate_adapter(adapter, tables.params, directions=_DIRECTIONS)
+    return table_metrics(mean[0], tables.values[0], np.zeros_like(mean[0]))["log_loss"]
+
+
+def _plain(adapter: Adapter) -> Principled:
+    """The adapter's only instance, as Python's floats."""
+    flat = adapter.numbers(np.zeros((1, adapter.space.size)), [0.5])[0, 0].tolist()
+    (p,) = target.from_numbers(flat, CONSTANT_PARAMS).instances
+    return p
+
+
+def _record(tables: Tables, recipe: Recipe, run: loop.Run) -> dict[str, Any]:
+    return {
+        "params": tables.params[0].tolist(),
+        "recipe": asdict(recipe),
+        "steps": run.step,
+        "seconds": round(run.seconds, 1),
+        "version": nma.__version__,
+        "jax": jax.__version__,
+        "date": time.strftime("%Y-%m-%d"),
+    }

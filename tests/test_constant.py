@@ -1,0 +1,199 @@
+"""One plain Principled BRDF for a material: the fit, its export to Mitsuba, and `nma principled`."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from target_cases import random_directions, random_principled, stacked
+
+from nma import cli, sources
+from nma.adapter import Adapter
+from nma.errors import ParamError, TableError
+from nma.evaluate import tabulate_adapter
+from nma.export.mitsuba import principled_dict, principled_xml
+from nma.jit import dr
+from nma.ops import Color, Vec3
+from nma.params import LAYERED3
+from nma.sources.mitsuba_bsdf import from_dict, from_string
+from nma.sources.nbrdf import WEIGHTS
+from nma.table import Tables
+from nma.tabulation import tabulate_values
+from nma.target import Principled, eval_principled
+from nma.train.constant import CONSTANT, fit_constant
+
+RED = Principled(Color(0.7, 0.15, 0.05), 0.35, 0.1, 0.6, 0.2, 0.3, 0.5, 0.6, 0.8, flatness=0.2)
+# Enough to see that fits run, to save time.
+BRIEF = replace(CONSTANT, steps=50, rows=8, bins_per_row=4)
+
+
+@pytest.fixture(scope="module")
+def red() -> Tables:
+    """The table of `RED`, from Mitsuba's own plugin."""
+    return tabulate_values(from_dict(principled_dict(RED)), points=16)
+
+
+@pytest.fixture
+def nma(monkeypatch, capsys):
+    """Runs `nma ARGUMENTS` with a fit of few steps in this process: exit status, stdout, stderr."""
+    monkeypatch.setattr("nma.train.constant.CONSTANT", BRIEF)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+            sys.exit(0)
+        return end.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+# ---- The fit ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_principled_brdf_is_recovered_from_its_table(red):
+    fit = fit_constant(red)
+    assert fit.log_loss < 0.001
+    assert fit.log_loss == fit.figures["log_loss"] == fit.adapter.training["log_loss"]
+    found = fit.principled
+    np.testing.assert_allclose(found.base_color, RED.base_color, atol=0.03)
+    for name in ("roughness", "metallic", "clearcoat", "clearcoat_gloss"):
+        assert getattr(found, name) == pytest.approx(getattr(RED, name), abs=0.06), name
+
+
+def test_equal_arguments_give_equal_fits(red):
+    one, other = (fit_constant(red, BRIEF, {"material": "red"}) for _ in range(2))
+    assert one.principled == other.principled
+    assert one.adapter.training["material"] == "red"
+    assert len(one.adapter.training["log_loss_of_starts"]) == 5
+
+
+def test_the_fit_is_an_adapter_that_can_be_saved(red, tmp_path):
+    """Of a simulated material, whose class is known."""
+    vector = LAYERED3.sample(np.random.default_rng(0), 1)
+    fit = fit_constant(Tables(vector, red.values, red.walks), BRIEF)
+    fit.adapter.save(tmp_path / "red.safetensors")
+    loaded = Adapter.load(tmp_path / "red.safetensors")
+    assert (loaded.variant, loaded.reciprocal) == ("single", True)
+    tables = [tabulate_adapter(a, vector, directions=1) for a in (fit.adapter, loaded)]
+    np.testing.assert_array_equal(*tables)
+    numbers = loaded.numbers(vector, [0.1, 0.9])[0]
+    np.testing.assert_array_equal(numbers[0], numbers[1])
+    np.testing.assert_allclose(numbers[0][:4], [*fit.principled.base_color, fit.principled.roughness])
+
+
+def test_only_isotropic_tables_of_one_material_are_fitted(red):
+    with pytest.raises(TableError, match="one material, the table has 2"):
+        fit_constant(Tables.concatenate([red, red]))
+    with pytest.raises(TableError, match="isotropic tables"):
+        fit_constant(Tables(np.zeros((1, 0)), np.zeros((1, 2, 4, 2, 4, 3)), np.ones(1, np.int64)))
+
+
+# ---- The export ------------------------------------------------------------------------------------------------------
+
+
+def lanes(w: Vec3) -> Vec3:
+    return Vec3(*(dr.auto.Float(np.asarray(x, np.float32)) for x in w))
+
+
+def instances() -> list[Principled]:
+    """Random parameters, and what Mitsuba writes in another way: no dielectric reflection, and a strong one."""
+    many = random_principled(np.random.default_rng(4), 8)
+    one = [
+        Principled(Color(*(float(c[n]) for c in many.base_color)), *(float(x[n]) for x in many[1:11]))
+        for n in range(8)
+    ]
+    return [*one, RED._replace(specular=0.0, metallic=0.5), RED._replace(specular=1.6), RED._replace(specular=1.0)]
+
+
+@pytest.mark.parametrize("p", instances())
+@pytest.mark.parametrize("form", ["dictionary", "XML"])
+def test_mitsuba_evaluates_the_export_to_the_same(p, form):
+    """2e-4 relative, off the horizon; clearcoats lose digits in single precision, as tests/test_target.py says."""
+    p = p._replace(clearcoat_gloss=min(p.clearcoat_gloss, 0.8))
+    bsdf = from_dict(principled_dict(p)) if form == "dictionary" else from_string(principled_xml(p))
+    rng = np.random.default_rng(5)
+    wi, wo = random_directions(rng, 4000), random_directions(rng, 4000)
+    expected = stacked(eval_principled(p, wi, wo))
+    value = stacked(Vec3(*(c.numpy() for c in bsdf.eval(lanes(wi), lanes(wo)))))
+    compared = (wi.z > 1e-2) & (wo.z > 1e-2)
+    np.testing.assert_allclose(value[:, compared], expected[:, compared], rtol=2e-4, atol=1e-6)
+
+
+def test_specular_is_written_as_eta_where_mitsuba_has_none():
+    assert principled_dict(RED)["specular"] == 0.6
+    assert "eta" not in principled_dict(RED)
+    for specular, eta in ((0.0, 1.00001), (1.6, 2.114153)):
+        description = principled_dict(RED._replace(specular=specular))
+        assert "specular" not in description
+        assert description["eta"] == pytest.approx(eta, abs=1e-6)
+
+
+@pytest.mark.parametrize("change", [{"anisotropic": -2.0}, {"specular": 13.0}, {"roughness": float("nan")}])
+def test_what_mitsuba_does_not_allow_is_refused(change):
+    with pytest.raises(ParamError, match=next(iter(change))):
+        principled_dict(RED._replace(**change))
+
+
+# ---- The command -----------------------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_json_and_writes_what_mitsuba_loads(nma, red, tmp_path):
+    red.save(tmp_path / "red.npz")
+    code, out, err = nma("principled", tmp_path / "red.npz", "-o", tmp_path / "new" / "red.xml")
+    assert code == 0, err
+    assert "log loss" in err
+    description = json.loads(out)
+    assert description["type"] == "principled"
+    again = nma("principled", tmp_path / "red.npz", "-o", tmp_path / "red.json")
+    assert json.loads(again[1]) == json.loads((tmp_path / "red.json").read_text()) == description
+    wi, wo = (lanes(random_directions(np.random.default_rng(n), 100)) for n in (6, 7))
+    one, other = from_dict(description), sources.read(tmp_path / "new" / "red.xml")
+    for a, b in zip(one.eval(wi, wo), other.eval(wi, wo), strict=True):
+        np.testing.assert_array_equal(a.numpy(), b.numpy())
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["red.xml"]
+
+
+def test_materials_values_and_one_of_many_tables_are_sources(nma, red, tmp_path):
+    assert json.loads(nma("principled", "gold-red-lacquer", "--walks", 16_000)[1])["type"] == "principled"
+    both = Tables.concatenate([red, red])
+    both.values[0] = 0.0
+    both.save(tmp_path / "both.npz")
+    colours = [
+        json.loads(nma("principled", tmp_path / "both.npz", "--material", n)[1])["base_color"]["value"]
+        for n in (0, 1)
+    ]
+    assert max(colours[0]) < 0.1 < max(colours[1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("gold-red-laquer",), "did you mean 'gold-red-lacquer'"),
+        (("no.toml",), "no material file"),
+        (("no.bsdf",), "no.bsdf"),
+        (("no.npz",), "no such file"),
+        (("picture.png",), "no source reads such files"),
+        (("both.npz",), "choose one with --material 0 .. 1"),
+        (("both.npz", "--material", "2"), "not '2'"),
+        (("networks.npz",), "say which"),
+        (("networks.npz", "--material", "b"), "no material 'b'"),
+        (("brushed.xml",), "anisotropic"),
+    ],
+)
+def test_a_mistake_is_one_line_on_stderr(nma, red, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    Tables(np.zeros((2, 0)), np.zeros((2, 2, 2, 2, 3)), np.ones(2, np.int64)).save("both.npz")
+    np.savez("networks.npz", names=np.array(["a"]), weights=np.zeros((1, WEIGHTS), np.float32))
+    (tmp_path / "brushed.xml").write_text(principled_xml(RED._replace(anisotropic=0.9)))
+    code, out, err = nma("principled", *arguments)
+    assert (code, out) == (1, "")
+    assert err.startswith("nma: ") and err.count("\n") == 1
+    assert message in err
+
+
+@pytest.mark.parametrize("arguments", [("-o", "gold.txt"), ("--material", "gold")])
+def test_wrong_usage_exits_with_2(nma, arguments):
+    assert nma("principled", "gold-red-lacquer", *arguments)[0] == 2
