@@ -21,11 +21,11 @@ from nma.sources.nbrdf import WEIGHTS
 from nma.table import Tables
 from nma.tabulation import tabulate_values
 from nma.target import Principled, eval_principled
-from nma.train.constant import CONSTANT, fit_constant
+from nma.train.constant import CONSTANT, Constant, fit_constant
 
 RED = Principled(Color(0.7, 0.15, 0.05), 0.35, 0.1, 0.6, 0.2, 0.3, 0.5, 0.6, 0.8, flatness=0.2)
-# Enough to see that fits run, to save time.
-BRIEF = replace(CONSTANT, steps=50, rows=8, bins_per_row=4)
+# Shorter than what `nma principled` does, to save time.
+SHORT = replace(CONSTANT, steps=400, rows=16, points=32)
 
 
 @pytest.fixture(scope="module")
@@ -34,52 +34,36 @@ def red() -> Tables:
     return tabulate_values(from_dict(principled_dict(RED)), points=16)
 
 
-@pytest.fixture
-def nma(monkeypatch, capsys):
-    """Runs `nma ARGUMENTS` with a fit of few steps in this process: exit status, stdout, stderr."""
-    monkeypatch.setattr("nma.train.constant.CONSTANT", BRIEF)
+@pytest.fixture(scope="module")
+def coated(red) -> Tables:
+    """The same, said to be a layered material's, so that its class is known."""
+    return Tables(LAYERED3.sample(np.random.default_rng(0), 1), red.values, red.walks)
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-            sys.exit(0)
-        return end.value.code or 0, *capsys.readouterr()
 
-    return run
+@pytest.fixture(scope="module")
+def fit(coated) -> Constant:
+    return fit_constant(coated, SHORT, {"material": "red"})
 
 
 # ---- The fit ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_principled_brdf_is_recovered_from_its_table(red):
-    fit = fit_constant(red)
-    assert fit.log_loss < 0.001
+def test_a_principled_brdf_is_recovered_from_its_table(fit):
+    assert fit.log_loss < 0.0005
     assert fit.log_loss == fit.figures["log_loss"] == fit.adapter.training["log_loss"]
-    found = fit.principled
-    np.testing.assert_allclose(found.base_color, RED.base_color, atol=0.03)
+    np.testing.assert_allclose(fit.principled.base_color, RED.base_color, atol=0.03)
     for name in ("roughness", "metallic", "clearcoat", "clearcoat_gloss"):
-        assert getattr(found, name) == pytest.approx(getattr(RED, name), abs=0.06), name
+        assert getattr(fit.principled, name) == pytest.approx(getattr(RED, name), abs=0.06), name
 
 
-def test_equal_arguments_give_equal_fits(red):
-    one, other = (fit_constant(red, BRIEF, {"material": "red"}) for _ in range(2))
-    assert one.principled == other.principled
-    assert one.adapter.training["material"] == "red"
-    assert len(one.adapter.training["log_loss_of_starts"]) == 5
-
-
-def test_the_fit_is_an_adapter_that_can_be_saved(red, tmp_path):
-    """Of a simulated material, whose class is known."""
-    vector = LAYERED3.sample(np.random.default_rng(0), 1)
-    fit = fit_constant(Tables(vector, red.values, red.walks), BRIEF)
+def test_the_fit_is_an_adapter_that_can_be_saved(fit, coated, tmp_path):
     fit.adapter.save(tmp_path / "red.safetensors")
     loaded = Adapter.load(tmp_path / "red.safetensors")
     assert (loaded.variant, loaded.reciprocal) == ("single", True)
-    tables = [tabulate_adapter(a, vector, directions=1) for a in (fit.adapter, loaded)]
+    assert loaded.training["material"] == "red"
+    tables = [tabulate_adapter(a, coated.params, directions=1) for a in (fit.adapter, loaded)]
     np.testing.assert_array_equal(*tables)
-    numbers = loaded.numbers(vector, [0.1, 0.9])[0]
+    numbers = loaded.numbers(coated.params, [0.1, 0.9])[0]
     np.testing.assert_array_equal(numbers[0], numbers[1])
     np.testing.assert_allclose(numbers[0][:4], [*fit.principled.base_color, fit.principled.roughness])
 
@@ -105,7 +89,12 @@ def instances() -> list[Principled]:
         Principled(Color(*(float(c[n]) for c in many.base_color)), *(float(x[n]) for x in many[1:11]))
         for n in range(8)
     ]
-    return [*one, RED._replace(specular=0.0, metallic=0.5), RED._replace(specular=1.6), RED._replace(specular=1.0)]
+    return [
+        *one,
+        RED._replace(specular=0.0, metallic=0.5),
+        RED._replace(specular=1.6),
+        RED._replace(specular=1.0),
+    ]
 
 
 @pytest.mark.parametrize("p", instances())
@@ -140,32 +129,87 @@ def test_what_mitsuba_does_not_allow_is_refused(change):
 # ---- The command -----------------------------------------------------------------------------------------------------
 
 
-def test_the_command_prints_json_and_writes_what_mitsuba_loads(nma, red, tmp_path):
+@pytest.fixture
+def nma(monkeypatch, capsys):
+    """Runs `nma ARGUMENTS` in this process: exit status, stdout, stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+            sys.exit(0)
+        return end.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def fitted(fit, monkeypatch) -> list[tuple]:
+    """Makes the command find `fit` whatever it is given; lists the tables and records that it was given."""
+    given = []
+
+    def find(tables, recipe, record, **options):
+        given.append((tables, record))
+        return fit
+
+    monkeypatch.setattr("nma.train.constant.fit_constant", find)
+    return given
+
+
+def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monkeypatch, tmp_path):
+    """The same as `fit_constant` finds: equal arguments give equal results, and a class without parameters will do."""
+    monkeypatch.setattr("nma.train.constant.CONSTANT", SHORT)
     red.save(tmp_path / "red.npz")
-    code, out, err = nma("principled", tmp_path / "red.npz", "-o", tmp_path / "new" / "red.xml")
+    code, out, err = nma("principled", tmp_path / "red.npz")
     assert code == 0, err
-    assert "log loss" in err
-    description = json.loads(out)
-    assert description["type"] == "principled"
-    again = nma("principled", tmp_path / "red.npz", "-o", tmp_path / "red.json")
-    assert json.loads(again[1]) == json.loads((tmp_path / "red.json").read_text()) == description
+    assert json.loads(out) == principled_dict(fit.principled)
+    assert f"log loss {fit.log_loss:.5f}" in err
+
+
+def test_the_command_writes_what_mitsuba_loads(nma, fit, fitted, red, tmp_path):
+    red.save(tmp_path / "red.npz")
+    folder = tmp_path / "new"
+    for ending in ("xml", "json", "safetensors"):
+        code, out, err = nma("principled", tmp_path / "red.npz", "-o", folder / f"red.{ending}")
+        assert code == 0, err
+        assert f"red.{ending}" in err
+    assert sorted(p.name for p in folder.iterdir()) == ["red.json", "red.safetensors", "red.xml"]
+    assert Adapter.load(folder / "red.safetensors").size == 12
+    description = json.loads((folder / "red.json").read_text())
+    assert description == json.loads(out) == principled_dict(fit.principled)
     wi, wo = (lanes(random_directions(np.random.default_rng(n), 100)) for n in (6, 7))
-    one, other = from_dict(description), sources.read(tmp_path / "new" / "red.xml")
+    one, other = from_dict(description), sources.read(folder / "red.xml")
     for a, b in zip(one.eval(wi, wo), other.eval(wi, wo), strict=True):
         np.testing.assert_array_equal(a.numpy(), b.numpy())
-    assert [p.name for p in (tmp_path / "new").iterdir()] == ["red.xml"]
 
 
-def test_materials_values_and_one_of_many_tables_are_sources(nma, red, tmp_path):
-    assert json.loads(nma("principled", "gold-red-lacquer", "--walks", 16_000)[1])["type"] == "principled"
-    both = Tables.concatenate([red, red])
-    both.values[0] = 0.0
-    both.save(tmp_path / "both.npz")
-    colours = [
-        json.loads(nma("principled", tmp_path / "both.npz", "--material", n)[1])["base_color"]["value"]
-        for n in (0, 1)
-    ]
-    assert max(colours[0]) < 0.1 < max(colours[1])
+def test_named_materials_values_and_tables_are_sources(nma, fitted, red, monkeypatch, tmp_path):
+    monkeypatch.setattr("nma.tabulation.POINTS", 16)
+    xml, both, networks = tmp_path / "red.xml", tmp_path / "both.npz", tmp_path / "networks.npz"
+    xml.write_text(principled_xml(RED))
+    np.savez(networks, names=np.array(["a", "b"]), weights=np.zeros((2, WEIGHTS), np.float32))
+    black = Tables(red.params, 0 * red.values, red.walks, red.error)
+    Tables.concatenate([black, red]).save(both)
+    for arguments in (
+        ("gold-red-lacquer", "--walks", 16_000, "--seed", 3),
+        (xml,),
+        (both, "--material", 1),
+        (networks, "--material", "b"),
+    ):
+        code, _, err = nma("principled", *arguments)
+        assert code == 0, err
+    (gold, *records), tables = [r for _, r in fitted], [t for t, _ in fitted]
+    assert gold == {
+        "data": "material gold-red-lacquer",
+        "material": "gold-red-lacquer",
+        "walks_per_material": 16_000,
+    }
+    assert [r["material"] for r in records] == ["red", "both 1", "b"]
+    assert [t.params.shape for t in tables] == [(1, 13), (1, 0), (1, 0), (1, 0)]
+    np.testing.assert_array_equal(tables[1].values, red.values)
+    np.testing.assert_array_equal(tables[2].values, red.values)
+    assert not tables[3].values.any()
 
 
 @pytest.mark.parametrize(
@@ -183,7 +227,7 @@ def test_materials_values_and_one_of_many_tables_are_sources(nma, red, tmp_path)
         (("brushed.xml",), "anisotropic"),
     ],
 )
-def test_a_mistake_is_one_line_on_stderr(nma, red, tmp_path, monkeypatch, arguments, message):
+def test_a_mistake_is_one_line_on_stderr(nma, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     Tables(np.zeros((2, 0)), np.zeros((2, 2, 2, 2, 3)), np.ones(2, np.int64)).save("both.npz")
     np.savez("networks.npz", names=np.array(["a"]), weights=np.zeros((1, WEIGHTS), np.float32))

@@ -17,9 +17,9 @@ app = typer.Typer(
     help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs "
     "by a tiny network.\n\n"
     "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
-    "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], or [bold]principled[/bold], judge with [bold]evaluate[/bold] and "
+    "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], judge with [bold]evaluate[/bold] and "
     "[bold]compare[/bold], look with [bold]render[/bold]. [bold]data[/bold] lists measured materials, "
-    "[bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
+    "[bold]principled[/bold] fits plain numbers, [bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
 for group in (data, datasets, learn, principled, view, native, system):
     group.register(app)

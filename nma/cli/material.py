@@ -88,7 +88,9 @@ def _number(path: Path, count: int, material: str | None) -> int:
         return 0
     if material is None or not material.isdecimal() or int(material) >= count:
         given = "" if material is None else f", not {material!r}"
-        raise TableError(f"{path}: holds {count} material(s); choose one with --material 0 .. {count - 1}{given}")
+        raise TableError(
+            f"{path}: holds {count} material(s); choose one with --material 0 .. {count - 1}{given}"
+        )
     return int(material)
 
 

@@ -32,10 +32,14 @@ def principled(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors)."
+            "--output",
+            "-o",
+            help="A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors).",
         ),
     ] = None,
-    walks: Annotated[int, typer.Option(help="Walks of the table, if the material is simulated.")] = 16_000_000,
+    walks: Annotated[
+        int, typer.Option(help="Walks of the table, if the material is simulated.")
+    ] = 16_000_000,
     steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the walks and of the batches.")] = 0,
 ) -> None:
@@ -53,20 +57,25 @@ def principled(
     from nma.train.constant import CONSTANT, fit_constant
 
     tables, record = tables_of(source, material, walks, seed)
-    recipe = replace(CONSTANT, seed=seed, **({} if steps is None else {"steps": steps}))
+    recipe = replace(CONSTANT, seed=seed)
+    if steps is not None:
+        recipe = replace(recipe, steps=steps)
     with console.TrainingBar(recipe, "fitting") as bar:
         fit = fit_constant(tables, recipe, record, progress=bar.update)
     description = principled_dict(fit.principled)
     print(_json(description))
     console.err.print(
-        f"log loss {fit.log_loss:.5f} over the table, albedo error {fit.figures['albedo_error']:.4f}", highlight=False
+        f"log loss {fit.log_loss:.5f} over the table, albedo error {fit.figures['albedo_error']:.4f}",
+        highlight=False,
     )
     if output is None:
         return
     if output.suffix == ".safetensors":
         fit.adapter.save(output)
     else:
-        _write(output, principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n")
+        _write(
+            output, principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
+        )
     console.err.print(f"wrote {output}", highlight=False)
 
 
