@@ -94,6 +94,7 @@ def instances() -> list[Principled]:
         RED._replace(specular=0.0, metallic=0.5),
         RED._replace(specular=1.6),
         RED._replace(specular=1.0),
+        RED._replace(specular=1e-6, metallic=0.5),
     ]
 
 

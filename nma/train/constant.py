@@ -29,8 +29,9 @@ from nma.train.recipe import Recipe
 # The paper's 11 numbers and the fake subsurface. `anisotropic` stays 0: tables of isotropic materials do not know it.
 CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
 
-# Many points in few bins: the absolute value in eq. 7 takes the noise of an average for an error, and with a handful of
-# points avoids it by dull lobes. The exact average of a bin also does without a term on the albedo.
+# Many points in few bins: eq. 7 takes the noise of a bin's average for an error, and a fit avoids what is noisy. With 4
+# points per bin, that of a Principled BRDF's own table ended at a log loss of .0023, with 64 at .00015, for a best of
+# .00014. A term on the albedo, which helps with few points, gains little then and doubles the time to compile.
 CONSTANT = Recipe(
     network="none",
     instances=1,
