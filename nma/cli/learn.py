@@ -13,6 +13,7 @@ import numpy as np
 import typer
 
 from nma.cli import console
+from nma.params import LAYERED3
 
 _Steps = Annotated[int | None, typer.Option(help="Number of optimisation steps.")]
 _Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.")]
@@ -25,7 +26,8 @@ _PointsLaw = Annotated[
 _Target = Annotated[
     str | None,
     typer.Option(
-        help="principled (the paper's 11 numbers), or stretched: lobes stretch along the plane of incidence."
+        help="principled (the paper's 11 numbers), stretched (lobes stretch along the plane of incidence), "
+        "measured (and fade out), or anisotropic (the same along the surface's axes)."
     ),
 ]
 _Albedo = Annotated[
@@ -108,9 +110,21 @@ def train(
 
 
 def fit(
-    material: Annotated[str, typer.Argument(help="A named material or a material file.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="A named material or a material file (.toml), which is simulated; a file of values (.bsdf, .binary, "
+            ".xml, NBRDF's .npz); or a reference file (.npz)."
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
-    walks: Annotated[int, typer.Option(help="Walks of the table to fit.")] = 64_000_000,
+    material: Annotated[
+        str | None,
+        typer.Option(
+            help="Which material of a file that holds several: a name, or a number in a reference file."
+        ),
+    ] = None,
+    walks: Annotated[int, typer.Option(help="Walks of the table of a simulated material.")] = 64_000_000,
     variant: Annotated[
         str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
     ] = "blended+omega_i",
@@ -125,20 +139,21 @@ def fit(
     learning_rate: _Rate = None,
     seed: _Seed = None,
 ) -> None:
-    """Overfit one material: simulate its table, then train a small network on it.
+    """Overfit one material: train a small network on its values, or on its table. See docs/bring-your-own.md.
 
-    Example: [bold]nma fit gold-red-lacquer -o gold.safetensors[/bold]
+    Examples: [bold]nma fit gold-red-lacquer -o gold.safetensors[/bold],
+    [bold]nma fit paper_white_rgb.bsdf -o paper.safetensors[/bold]
     """
-    from nma import materials, sources
-    from nma.table import stream_keys, tabulate
-    from nma.train import recipe as recipes
+    from nma.cli.material import read
+    from nma.table import Tables
     from nma.train import run as training
+    from nma.train.fit import fit as fit_one
+    from nma.train.fit import recipe_for
 
-    source_material = materials.load(material)
-    source = sources.get(source_material.class_name)
+    known, record = read(source, material, walks, seed or 0)
     lobes, directional = _variant(variant)
-    recipe = recipes.preset(
-        "single",
+    recipe = recipe_for(
+        known,
         network=network,
         target=target or _target(directional),
         steps=steps,
@@ -152,16 +167,16 @@ def fit(
         instances=lobes,
         directional=directional,
     )
-    vector = source_material.vector()
-    began = time.perf_counter()
-    tables = tabulate(source, vector[None], walks, stream_keys(recipe.seed, range(1)), error=False)
-    console.err.print(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
-    record = {"data": f"material {material}", "material": source_material.name, "walks_per_material": walks}
     with console.TrainingBar(recipe) as bar:
-        adapter, run = training.fit_material(
-            source.space, recipe, vector, tables, record, progress=bar.update
-        )
+        if isinstance(known, Tables) and known.params.shape[1] == LAYERED3.size:
+            adapter, run = training.fit_material(
+                LAYERED3, recipe, known.params[0], known, record, progress=bar.update
+            )
+        else:
+            adapter, run = fit_one(known, recipe, record, progress=bar.update)
     _finish(adapter, run, output)
+    if not isinstance(known, Tables):
+        _compare(adapter, known)
 
 
 def evaluate(
@@ -211,6 +226,16 @@ def evaluate(
         console.out.print(
             "The reference has no standard errors; its noise floor is an upper bound from counting walks."
         )
+
+
+def _compare(adapter, source) -> None:
+    """Says how far the adapter is from a source with values."""
+    from nma.pairs import PAIRS, compare
+    from nma.sources.adapter import AdapterValues
+
+    figures = compare(AdapterValues(adapter), source)
+    listed = ", ".join(f"{name} {value:.5f}" for name, value in figures.items())
+    console.err.print(f"against {source.name} at {PAIRS:,} pairs of directions: {listed}")
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:

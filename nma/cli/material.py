@@ -1,4 +1,4 @@
-"""What a command's SOURCE means: any description of one material, turned into its table."""
+"""What a command's SOURCE means: any description of one material, as what is known of it or as its table."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from nma.cli import console
 from nma.errors import SourceError, TableError
 
 if TYPE_CHECKING:
+    from nma.sources.base import Values
     from nma.table import Tables
 
 
-def tables_of(
+def read(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
-) -> tuple[Tables, dict[str, Any]]:
-    """The isotropic table of one material, and the record of where it comes from.
+) -> tuple[Values | Tables, dict[str, Any]]:
+    """What is known of one material, its values or its table, and the record of where that comes from.
 
     `source` is a named material or a material file (.toml), which are simulated with so many `walks`; a file that
-    `nma.sources.read` understands, whose values are averaged over bins; or a reference file (.npz). `material` chooses
-    in a file that holds several: by name among NBRDF networks, by number in a reference file.
+    `nma.sources.read` understands, which has values; or a reference file (.npz). `material` chooses in a file that
+    holds several: by name among NBRDF networks, by number in a reference file.
 
-    The record has `data`, the kind and name of the source, `material`, the material's name, and `walks_per_material` or
-    `points_per_bin`. Raises `NmaError` for what cannot be read, and for anisotropic materials.
+    The record has `data`, the kind and name of the source, `material`, the material's name, and for simulations
+    `walks_per_material`. Raises `NmaError` for what cannot be read.
     """
     from nma import materials
 
@@ -38,6 +39,25 @@ def tables_of(
     if path.suffix in ("", ".toml") or source in materials.names():
         return _simulated(source, walks, seed)
     return _values(path, None)
+
+
+def tables_of(
+    source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
+) -> tuple[Tables, dict[str, Any]]:
+    """The isotropic table of one material, and the record, as of `read`, with the number of `points_per_bin` where
+    values were averaged over bins. Raises `SourceError` for anisotropic materials."""
+    from nma.table import Tables
+    from nma.tabulation import POINTS, tabulate_values
+
+    known, record = read(source, material, walks, seed)
+    if isinstance(known, Tables):
+        return known, record
+    if not known.isotropic:
+        raise SourceError(f"{source}: {known.name} is anisotropic, only isotropic materials can be fitted")
+    began = time.perf_counter()
+    tables = tabulate_values(known, points=POINTS)
+    console.err.print(f"tabulated {known.name} in {time.perf_counter() - began:.1f} s")
+    return tables, {**record, "points_per_bin": POINTS}
 
 
 def _simulated(name: str, walks: int, seed: int) -> tuple[Tables, dict[str, Any]]:
@@ -54,18 +74,11 @@ def _simulated(name: str, walks: int, seed: int) -> tuple[Tables, dict[str, Any]
     return tables, record
 
 
-def _values(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]]:
+def _values(path: Path, material: str | None) -> tuple[Values, dict[str, Any]]:
     from nma import sources
-    from nma.tabulation import POINTS, tabulate_values
 
     values = sources.read(path, material)
-    if not values.isotropic:
-        raise SourceError(f"{path}: {values.name} is anisotropic, only isotropic materials can be fitted")
-    began = time.perf_counter()
-    tables = tabulate_values(values, points=POINTS)
-    console.err.print(f"tabulated {values.name} in {time.perf_counter() - began:.1f} s")
-    record = {"data": f"values of {path.name}", "material": material or path.stem, "points_per_bin": POINTS}
-    return tables, record
+    return values, {"data": f"values of {path.name}", "material": material or path.stem}
 
 
 def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]]:

@@ -52,7 +52,11 @@ def register(app: typer.Typer) -> None:
 def render(
     context: typer.Context,
     subject: Annotated[
-        str, typer.Argument(help="A named material, a material file (.toml) or a Mitsuba scene (.xml).")
+        str,
+        typer.Argument(
+            help="A named material, a material file (.toml), the adapter of a single material (.safetensors), or a "
+            "Mitsuba scene (.xml)."
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -104,6 +108,9 @@ def render(
     else:
         _refuse(context, ("define",), "a material")
         view = _View(pixels or (512, 512), spp or 128, depth, camera, envmap, variant)
+        if subject.endswith(".safetensors"):
+            _refuse(context, ("model", "adapter", "changes"), "an adapter")
+            adapter = subject
         scene, spp = view.load(_material(subject, changes), model, adapter, clamp), view.spp
     _write(_render(scene, spp, seed, subject), scene, files, exposure)
 
@@ -289,7 +296,11 @@ def _write_difference(path: Path, title: str, name: str, test: Any, reference: A
 
 def _material(name: str, changes: list[str] | None) -> Material:
     from nma import materials
+    from nma.params import MEASURED
 
+    if name.endswith(".safetensors"):
+        # An adapter that knows a single material is one.
+        return materials.Material(Path(name).stem, name, "", MEASURED.name, {})
     material = materials.load(name)
     return material.changed(dict(map(_change, changes)), "--set") if changes else material
 

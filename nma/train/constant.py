@@ -18,7 +18,7 @@ from nma.errors import TableError
 from nma.evaluate import evaluate, tabulate_adapter
 from nma.metrics import table_metrics
 from nma.ops import Color
-from nma.params import SPACES, ParamSpace
+from nma.params import SPACES
 from nma.table import ISOTROPIC, Tables
 from nma.target import PRINCIPLED_PARAMS, Blend, Principled, TargetParam
 from nma.train import loop
@@ -59,8 +59,6 @@ _STARTS = {
 
 # cos(theta_i) per row of the table that tell which fit is best.
 _DIRECTIONS = 16
-
-_MEASURED = ParamSpace("measured", ())
 
 
 class Constant(NamedTuple):
@@ -129,7 +127,7 @@ def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array,
 def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -> Adapter:
     """An adapter whose network is its output's bias alone."""
     size = tables.params.shape[1]
-    space = next((s for s in SPACES.values() if s.size == size), _MEASURED)
+    space = next(s for s in SPACES.values() if s.size == size)
     layers = [(np.zeros((len(raw), 1), np.float32), np.asarray(raw, np.float32))]
     return Adapter(space, "direction", layers, 1, False, CONSTANT_PARAMS, record)
 

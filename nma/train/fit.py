@@ -20,7 +20,11 @@ Progress = Callable[[loop.Run], None]
 
 
 def recipe_for(source: Values | Tables, **changes: Any) -> Recipe:
-    """The settings that suit a source, isotropic or not, with or without noise; `changes` as `Recipe` has them."""
+    """The settings that suit a source, isotropic or not, with or without noise.
+
+    `changes` are fields of `Recipe`; None leaves one as it is.
+    """
+    changes = {name: value for name, value in changes.items() if value is not None}
     if isinstance(source, Tables):
         grid = source.grid
         suited = {"encoding": "azimuth", "target": "anisotropic"} if grid.phi_i else {}
