@@ -47,7 +47,7 @@ def test_weighted_points_are_uniform_over_the_hemisphere():
         rows = (pool.weight * function).mean(axis=1)
         assert abs(rows.mean() - expected) < 0.003
         assert rows.std() < 0.05
-    assert ((pool.weight >= 0) & (pool.weight <= 2.0 + 1e-5)).all()
+    assert ((pool.weight >= 0) & (pool.weight <= 4 / 3 + 1e-5)).all()
     assert (np.sort(pool.mu) * 512 // 1 == np.arange(512)).all()
 
 
@@ -134,6 +134,8 @@ def test_recipes_and_sources_must_agree_on_isotropy():
         fit(from_dict(BRUSHED), QUICK, {})
     with pytest.raises(NmaError, match="the table is isotropic; take a recipe for such"):
         fit(tabulate_values(LAMBERT, grid=SMALL), recipes.ANISOTROPIC)
+    with pytest.raises(NmaError, match="formula has values without noise, which the loss 'log' is for"):
+        fit(LAMBERT, replace(QUICK, loss="huber"))
     with pytest.raises(NmaError, match="anisotropic tables and an anisotropic target belong together"):
         replace(recipes.MEASURED, target="anisotropic")
 

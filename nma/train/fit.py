@@ -51,6 +51,10 @@ def fit(
     if isinstance(source, Tables):
         return _fit_table(source, recipe, record or {}, progress, budget_seconds)
     _check_isotropy(source.name, source.isotropic, recipe)
+    if recipe.loss != "log":
+        raise NmaError(
+            f"{source.name} has values without noise, which the loss 'log' is for, not '{recipe.loss}'"
+        )
     pool = PointPool.of(source, seed=recipe.seed)
     run = loop.start(recipe, initial_layers(recipe, MEASURED), record)
     loop.train(

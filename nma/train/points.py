@@ -25,9 +25,12 @@ from nma.target.sampling import sample_spec
 from nma.train.loss import albedo_loss, blend_of, view
 from nma.train.recipe import Recipe
 
-# View directions of the pool, and points wo of each: half of them uniform, half crowded around the mirror direction.
+# View directions of the pool, and points wo of each.
 ROWS, POINTS = 8192, 512
-# Widths of the microfacet lobes that the crowded half is drawn from.
+# One point of so many crowds around the mirror direction, the others are uniform: enough to find narrow lobes, and few,
+# as what is smooth learns less from them.
+_CROWDED = 4
+# Widths of the microfacet lobes that crowded points are drawn from.
 _WIDTHS = tuple(0.0005 * 2.0**k for k in range(11))
 # Rows that are evaluated at once: bounds the memory.
 _ROWS_PER_LAUNCH = 2048
@@ -84,7 +87,7 @@ class PointPool:
         """The points of one step: random rows, and in each a random share of its points."""
         rng = np.random.default_rng((recipe.seed, step, 0x90))
         m = rng.integers(len(self.mu), size=recipe.rows)
-        # Strides keep uniform and crowded points in balance: they alternate.
+        # Neighbours, as uniform and crowded points take turns.
         count = recipe.bins_per_row * recipe.points
         k = (
             rng.integers(self.weight.shape[1], size=recipe.rows) + np.arange(count)[:, None]
@@ -113,7 +116,7 @@ def _evaluated(
     u = [lanes((x + s[:, None]) % 1.0) for x, s in zip(ava.lattice(points).T, shift, strict=True)]
     sin = np.sqrt(1.0 - mu * mu)
     wi = Vec3(*(lanes(c[:, None]) for c in (sin * np.cos(phi), sin * np.sin(phi), mu)))
-    wo, weight = _directions(wi, u, lanes(np.arange(points)[None] % 2))
+    wo, weight = _directions(wi, u, lanes(np.arange(points)[None] % _CROWDED == 0))
     value = source.eval(wi, wo)
     arrays = [np.stack([c.numpy() for c in triple]) for triple in (wo, value)]
     shape = (len(mu), points)
@@ -132,7 +135,8 @@ def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
     h = h * (1.0 / ops.maximum(ops.sqrt(ops.dot(h, h)), 1e-9))
     facing = 4.0 * ops.maximum(ops.dot(wi, h), 1e-9)
     lobes = sum(visible_normal_pdf(wi, h, a, a) for a in _WIDTHS) / (facing * len(_WIDTHS))
-    density = 0.5 / (2.0 * math.pi) + 0.5 * lobes
+    share = 1.0 / _CROWDED
+    density = (1.0 - share) / (2.0 * math.pi) + share * lobes
     return wo, ops.select(wo.z > 0, 1.0 / (2.0 * math.pi * density), 0.0)
 
 
