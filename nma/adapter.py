@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -91,8 +91,8 @@ class Adapter:
         adapter._check(path, header.dialect)
         return adapter
 
-    def save(self, path: str | Path) -> None:
-        """Writes a weights file, atomically."""
+    def save(self, path: str | Path, more: Mapping[str, NDArray] | None = None) -> None:
+        """Writes a weights file, atomically, with `more` tensors than the network's where there are such."""
         header = weights.Header(
             class_name=self.space.name,
             parameters=weights.describe(self.space),
@@ -106,7 +106,7 @@ class Adapter:
             target=params_to_json(self.target),
             training=self.training,
         )
-        weights.write(path, header, self.layers)
+        weights.write(path, header, self.layers, more)
 
     @property
     def variant(self) -> str:

@@ -216,4 +216,23 @@ LAYERED3 = ParamSpace(
 # A single material, of which nothing is known but its values: measured, tabulated, or somebody else's BSDF.
 MEASURED = ParamSpace("measured", ())
 
-SPACES = {space.name: space for space in (LAYERED3, MEASURED)}
+# A material of a library (`nma.library`) by its learned code, whose numbers mean nothing one by one.
+CODE_BOUND = 4.0
+LIBRARY = ParamSpace(
+    "library",
+    (
+        Param(
+            "code",
+            "z",
+            "uniform",
+            -CODE_BOUND,
+            CODE_BOUND,
+            -CODE_BOUND,
+            CODE_BOUND,
+            "place in the latent space",
+            32,
+        ),
+    ),
+)
+
+SPACES = {space.name: space for space in (LAYERED3, MEASURED, LIBRARY)}

@@ -1,13 +1,14 @@
 """The weights file: safetensors, with everything needed to use the network as JSON in its header.
 
-Tensors `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight`, ... float32. The header's metadata has one
-entry, `nma`, a JSON object with the fields of `Header`.
+Tensors `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight`, ... float32; a library (`nma.library`) has one
+more. The header's metadata has one entry, `nma`, a JSON object with the fields of `Header`.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, get_origin, get_type_hints
@@ -53,9 +54,11 @@ def describe(space: ParamSpace) -> list[dict[str, Any]]:
     return [{k: None if v in (float("inf"), float("-inf")) else v for k, v in row.items()} for row in rows]
 
 
-def write(path: str | Path, header: Header, layers: Layers) -> None:
-    """Writes the file atomically."""
-    tensors = {}
+def write(
+    path: str | Path, header: Header, layers: Layers, more: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Writes the file atomically, with `more` tensors than the layers where there are such."""
+    tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in (more or {}).items()}
     for number, (matrix, bias) in enumerate(layers):
         tensors[f"layer{number}.weight"] = np.ascontiguousarray(matrix, np.float32)
         tensors[f"layer{number}.bias"] = np.ascontiguousarray(bias, np.float32)

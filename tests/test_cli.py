@@ -77,7 +77,7 @@ def test_every_command_explains_itself(nma, command):
 def test_the_documentation_has_every_command_with_every_option():
     """docs/commands.md has a section for each command, and in it exactly the options that the command takes."""
     text = (DOCS / "commands.md").read_text()
-    sections = dict(re.findall(r"^## `nma (\w+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
+    sections = dict(re.findall(r"^## `nma ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
     assert set(sections) == set(COMMANDS)
     for command, section in sections.items():
         options = {

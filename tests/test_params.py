@@ -10,7 +10,7 @@ from scipy import stats
 
 from nma.data import load_conductors
 from nma.errors import ParamError
-from nma.params import LAYERED3, SPACES, Param, ParamSpace
+from nma.params import LAYERED3, LIBRARY, MEASURED, SPACES, Param, ParamSpace
 
 FALSE_ALARM = 1e-3
 DRAWS = 20_000
@@ -138,7 +138,7 @@ def test_an_unknown_population_is_refused():
 
 
 def test_the_class_is_table_1():
-    assert SPACES["layered3"] is LAYERED3
+    assert SPACES == {"layered3": LAYERED3, "measured": MEASURED, "library": LIBRARY}
     assert tuple(p.name for p in LAYERED3.params) == NAMES
     assert LAYERED3.size == 13
     assert [(s.start, s.stop) for s in LAYERED3.slices.values()] == [

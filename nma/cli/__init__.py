@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from nma.cli import data, datasets, learn, native, principled, system, view
+from nma.cli import data, datasets, learn, library, native, principled, system, view
 from nma.errors import NmaError
 
 app = typer.Typer(
@@ -17,11 +17,13 @@ app = typer.Typer(
     help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs "
     "by a tiny network.\n\n"
     "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
-    "[bold]dataset[/bold], learn with [bold]train[/bold] and [bold]fit[/bold], judge with [bold]evaluate[/bold] and "
-    "[bold]compare[/bold], look with [bold]render[/bold]. [bold]data[/bold] lists measured materials, "
-    "[bold]principled[/bold] fits plain numbers, [bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
+    "[bold]dataset[/bold], learn with [bold]train[/bold], [bold]fit[/bold] and [bold]train-library[/bold], "
+    "judge with [bold]evaluate[/bold] and [bold]compare[/bold], look with [bold]render[/bold]. [bold]data[/bold] lists "
+    "measured materials, [bold]library[/bold] learns codes for more of them, [bold]principled[/bold] fits plain "
+    "numbers, "
+    "[bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
-for group in (data, datasets, learn, principled, view, native, system):
+for group in (data, datasets, learn, library, principled, view, native, system):
     group.register(app)
 
 

@@ -11,6 +11,7 @@ from nma import native
 PLUGINS = {
     "layered": "nma.render.layered",
     "nma": "nma.render.adapter_bsdf",
+    "values": "nma.render.values_bsdf",
 }
 
 _registered = False

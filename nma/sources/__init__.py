@@ -69,6 +69,11 @@ _READERS: dict[str, Callable[[Path, str | None], Values]] = {
 }
 
 
+def endings() -> tuple[str, ...]:
+    """How the names of files end that `read` understands."""
+    return tuple(_READERS)
+
+
 def read(path: str | Path, material: str | None = None) -> Values:
     """The values of one material, from a file.
 

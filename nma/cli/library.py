@@ -1,0 +1,163 @@
+"""`nma train-library`, `nma library`: many materials in one network, and codes for more of them."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from nma.cli import console
+
+library = typer.Typer(
+    no_args_is_help=True, help="Look at a library, learn the code of one more material, take one out."
+)
+
+_Library = Annotated[Path, typer.Argument(metavar="LIBRARY", help="A library that `nma train-library` made.")]
+
+
+def register(app: typer.Typer) -> None:
+    app.command("train-library")(train_library)
+    app.add_typer(library, name="library")
+
+
+def train_library(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR", help="A folder with files of materials, or one NBRDF weights file (.npz)."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    network: Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Peak of the learning rate.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of codes, weights and batches.")] = None,
+) -> None:
+    """Train one small network on many materials, with a code for each: a library (paper Fig. 12).
+
+    Tables wait in OUTPUT.tables, training in OUTPUT.ckpt: a killed run goes on when the command is repeated.
+
+    Example: [bold]nma train-library ~/merl -o library.safetensors[/bold]
+    """
+    from nma import collection
+    from nma.train import library as training
+    from nma.train.plot import plot_losses
+
+    members = collection.members(source)
+    names = [member.name for member in members]
+    given: dict[str, Any] = {"network": network, "steps": steps, "learning_rate": learning_rate, "seed": seed}
+    recipe = replace(training.RECIPE, **{k: v for k, v in given.items() if v is not None})
+    with console.progress("materials/s") as bar:
+        task = bar.add_task("tabulating", total=len(members), rate="", note="")
+        began = time.perf_counter()
+
+        def progress(done: int) -> None:
+            rate = done / (time.perf_counter() - began)
+            bar.update(task, completed=done, rate=f"{rate:.2f}", note=names[done - 1])
+
+        tables = collection.tables(members, output.with_name(output.name + ".tables"), progress)
+    record: dict[str, Any] = {"data": collection.origin(members), "materials": len(members)}
+    record["tables"] = hashlib.sha256("\n".join(names).encode() + tables.values.tobytes()).hexdigest()[:16]
+    checkpoint = output.with_name(output.name + ".ckpt")
+    with console.TrainingBar(recipe) as training_bar:
+        made, run = training.train_library(
+            names, tables, recipe, record, checkpoint=checkpoint, progress=training_bar.update
+        )
+    made.save(output)
+    plot = plot_losses(run.log_losses, output.with_suffix(".loss.png"), output.name)
+    checkpoint.unlink(missing_ok=True)
+    recent = run.log_losses[-500:]
+    console.err.print(
+        f"{output}: {run.step} steps in {run.seconds:.0f} s, log loss of the last steps "
+        f"{sum(recent) / len(recent):.5f}; losses in {plot}"
+    )
+    console.out.print(
+        f"{len(names)} materials ({record['data']}), {made.parameters:,} parameters: {made.codes.size:,} of codes, "
+        f"{made.parameters - made.codes.size:,} of the network",
+        highlight=False,
+    )
+
+
+@library.command("list")
+def listing(path: _Library) -> None:
+    """List the materials of a library."""
+    from nma.library import Library
+
+    for name in Library.load(path).names:
+        console.out.print(name, highlight=False, markup=False, soft_wrap=True)
+
+
+@library.command()
+def encode(
+    path: _Library,
+    source: Annotated[Path, typer.Argument(help="A file with the new material's values.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The library with one material more.")],
+    material: Annotated[str | None, typer.Option(help="Which one, in a file of several.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="What to call it; without, its own name or the file's.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the batches.")] = 0,
+) -> None:
+    """Learn the code of a material that the library has not seen; its network stays as it is.
+
+    Example: [bold]nma library encode library.safetensors paper_white_rgb.bsdf -o more.safetensors[/bold]
+    """
+    from nma import sources
+    from nma.errors import ParamError
+    from nma.library import Library
+    from nma.tabulation import tabulate_values
+    from nma.train import library as training
+
+    known = Library.load(path)
+    name = name or material or source.stem
+    if name in known.names:
+        raise ParamError(f"{path} has a material '{name}'; give the new one another with --name")
+    values = sources.read(source, material)
+    with console.err.status(f"tabulating {values.name}"):
+        tables = tabulate_values(values)
+    recipe = replace(training.ENCODING, seed=seed, steps=steps or training.ENCODING.steps)
+    began = time.perf_counter()
+    with console.TrainingBar(recipe, "encoding") as bar:
+        found = training.encode(known, tables, recipe=recipe, progress=bar.update)
+    known.add(name, found.code).save(output)
+    console.err.print(f"{output}: {name} added in {time.perf_counter() - began:.0f} s")
+    console.out.print(
+        f"{name}: log loss {found.log_loss:.5f}; the nearest of the library, {found.nearest}, has "
+        f"{found.nearest_log_loss:.5f}",
+        highlight=False,
+    )
+
+
+@library.command()
+def extract(
+    path: _Library,
+    materials: Annotated[
+        list[str], typer.Argument(help="A material's name, or NAME=WEIGHT of several to mix their codes.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+) -> None:
+    """Write one material of a library, or a mixture of some, as an adapter of its own.
+
+    Example: [bold]nma library extract library.safetensors brass=.7 blue-rubber=.3 -o mixed.safetensors[/bold]
+    """
+    from nma.library import Library
+
+    known = Library.load(path)
+    shares = dict(_share(text) for text in materials)
+    code = known.mix(list(shares), list(shares.values()))
+    known.material(code, " ".join(materials)).save(output)
+    console.err.print(f"{output}: {' '.join(materials)}")
+
+
+def _share(text: str) -> tuple[str, float]:
+    """A material and its weight in a mixture."""
+    name, equals, number = text.partition("=")
+    try:
+        return name, float(number) if equals else 1.0
+    except ValueError:
+        raise typer.BadParameter(f"'{text}' is no NAME=WEIGHT with a number as its weight") from None

@@ -1,0 +1,142 @@
+"""A library: many materials in one small network, each a point of its latent space (paper Fig. 12).
+
+A library is an adapter of the class `library`, whose only parameter is a material's `code`, with the codes and names
+of the materials that it was trained on. Codes may be mixed, and one may be learned for a material that was not there.
+
+    library = Library.load("library.safetensors")
+    code = library.mix(["gold-metallic-paint", "blue-rubber"], [0.7, 0.3])
+    library.material(code).save("bluish-gold.safetensors")       # an ordinary adapter of that one material
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from safetensors import safe_open
+
+from nma import network
+from nma.adapter import Adapter, weights_file
+from nma.errors import ParamError, WeightsError
+from nma.params import LIBRARY, MEASURED
+from nma.sources.base import Values
+from nma.table import Tables
+
+if TYPE_CHECKING:
+    from nma.train.library import Encoded
+
+CODES = "codes"
+
+
+@dataclass(frozen=True)
+class Library:
+    """An adapter of the class `library`, and its materials: `names`, and `codes` (n, 32) in their order."""
+
+    adapter: Adapter
+    names: tuple[str, ...]
+    codes: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        shape = (len(self.names), LIBRARY.size)
+        if self.adapter.space != LIBRARY or self.adapter.encoding != "raw":
+            raise WeightsError(
+                f"a library's adapter takes the code of class {LIBRARY.name} as it is; this one is for class "
+                f"{self.adapter.space.name}, encoding {self.adapter.encoding}"
+            )
+        if not self.names or len(set(self.names)) < len(self.names) or self.codes.shape != shape:
+            raise WeightsError(
+                f"{len(self.names)} names, which must differ, and codes {self.codes.shape} do not belong together"
+            )
+
+    @staticmethod
+    def load(path: str | Path) -> Library:
+        """Reads a library's weights file; `WeightsError` says what is wrong with it."""
+        path = weights_file(path)
+        adapter = Adapter.load(path)
+        names = adapter.training.get("names")
+        with safe_open(path, framework="numpy") as f:
+            codes = f.get_tensor(CODES) if CODES in f.keys() else None  # noqa: SIM118
+        if adapter.space != LIBRARY or codes is None or not isinstance(names, list):
+            raise WeightsError(
+                f"{path}: an adapter of class {adapter.space.name}, not a library; `nma train-library` makes one"
+            )
+        try:
+            library = Library(adapter, tuple(names), codes)
+            LIBRARY.check(codes, "training")
+        except (WeightsError, ParamError) as e:
+            raise WeightsError(f"{path}: {e}; copy or train it again") from None
+        return library
+
+    def save(self, path: str | Path) -> None:
+        """Writes a weights file, atomically. `Adapter.load` and the C++ runtime read it as well."""
+        training = {**self.adapter.training, "names": list(self.names)}
+        replace(self.adapter, training=training).save(path, {CODES: self.codes})
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers were trained: codes and network."""
+        return self.codes.size + network.parameters(self.adapter.layers)
+
+    def code(self, name: str) -> NDArray[np.float32]:
+        """The code (32,) of a material. Raises `ParamError` for a name that is not there."""
+        if name not in self.names:
+            near = difflib.get_close_matches(name, self.names, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(self.names[:5])}, ..."
+            raise ParamError(f"no material '{name}' among the library's {len(self.names)}; {hint}")
+        return self.codes[self.names.index(name)]
+
+    def mix(self, names: Sequence[str], weights: ArrayLike) -> NDArray[np.float32]:
+        """The code (32,) between those of some materials, in proportion to `weights`, which are at least 0."""
+        shares = np.asarray(weights, np.float64)
+        if shares.shape != (len(names),) or not (np.isfinite(shares).all() and (shares >= 0).all()):
+            raise ParamError(
+                f"{len(names)} materials want as many weights of at least 0, got {shares.tolist()}"
+            )
+        if not shares.sum() > 0:
+            raise ParamError("the weights of a mixture are all 0; give one of them more")
+        codes = np.stack([self.code(name) for name in names])
+        return (shares / shares.sum() @ codes).astype(np.float32)
+
+    def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
+        """One material as an adapter of its own that sees the direction alone: its code becomes part of the biases."""
+        code = LIBRARY.check(code, "training")
+        if len(code) != 1:
+            raise ParamError(f"one code makes one material; got {len(code)}")
+        (matrix, bias), *rest = self.adapter.layers
+        bias = bias + matrix[:, : LIBRARY.size] @ code[0]
+        if self.adapter.directional:
+            # The encoding "direction" is 2 cos(theta_i) - 1.
+            column = 0.5 * matrix[:, LIBRARY.size :]
+            bias = bias + column[:, 0]
+        else:
+            column = np.zeros((len(bias), 1))
+        first = column.astype(np.float32), bias.astype(np.float32)
+        training = {"library": self.adapter.training.get("data"), "code": code[0].tolist()}
+        training |= {"material": name} if name else {}
+        return replace(
+            self.adapter, space=MEASURED, encoding="direction", layers=[first, *rest], training=training
+        )
+
+    def add(self, name: str, code: ArrayLike) -> Library:
+        """A library with one material more. Raises `ParamError` if it has one of that name."""
+        if name in self.names:
+            raise ParamError(f"the library has a material '{name}'; choose another name")
+        codes = np.concatenate([self.codes, LIBRARY.check(code, "training").astype(np.float32)])
+        return replace(self, names=(*self.names, name), codes=codes)
+
+    def encode(self, material: Tables | Values, **settings: Any) -> Encoded:
+        """Learns the code of a material that the library was not trained on, the network as it is.
+
+        `material` is a source, or a table. Takes half a minute or so, and the extra `train`; `settings` are those of
+        `nma.train.library.encode`.
+        """
+        from nma.tabulation import tabulate_values
+        from nma.train.library import encode
+
+        tables = material if isinstance(material, Tables) else tabulate_values(material)
+        return encode(self, tables, **settings)

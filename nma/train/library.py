@@ -1,0 +1,197 @@
+"""Training a library, codes and network at once, and learning the code of one more material."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.errors import TableError
+from nma.evaluate import tabulate_adapter
+from nma.library import Library
+from nma.metrics import table_metrics
+from nma.params import CODE_BOUND, LIBRARY
+from nma.table import ISOTROPIC, Tables
+from nma.train import loop
+from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.loss import bin_means, blend_of, distance, loss
+from nma.train.recipe import Recipe
+from nma.train.run import _adapter, initial_layers
+
+# 20 minutes or less on two cores for a hundred materials, tables included.
+RECIPE = Recipe(
+    network="3x32",
+    encoding="raw",
+    rows=256,
+    bins_per_row=8,
+    points=8,
+    albedo=0.3,
+    learning_rate=1e-2,
+    average=0.999,
+    steps=40_000,
+)
+
+# One code: the network is known, so that a thousand steps do.
+ENCODING = replace(RECIPE, learning_rate=3e-2, average=0.99, steps=1_000)
+
+# Materials whose codes the search for another one starts from, beside the mean of all.
+NEAREST = 3
+# Spread of the codes at the start.
+_SPREAD = 0.5
+# Batches that codes are compared by.
+_JUDGED = 8
+
+
+def train_library(
+    names: Sequence[str],
+    tables: Tables,
+    recipe: Recipe,
+    record: dict[str, Any],
+    *,
+    checkpoint: Path | None = None,
+    progress: Callable[[loop.Run], None] = lambda run: None,
+    budget_seconds: float = float("inf"),
+) -> tuple[Library, loop.Run]:
+    """Learns a code for each of some materials, and the network that they share.
+
+    `record` says where the tables come from; it is stored with the weights, and a checkpoint of other data is refused.
+    """
+    if len(names) != len(tables.values) or tables.values.shape[1:] != ISOTROPIC.shape:
+        raise TableError(
+            f"a library of {len(names)} materials wants as many tables {ISOTROPIC.shape}, got {tables.values.shape}"
+        )
+    rng = np.random.default_rng((recipe.seed, 0xC0DE))
+    free = _SPREAD * rng.standard_normal((len(names), LIBRARY.size))
+    weights = free.astype(np.float32), initial_layers(recipe, LIBRARY)
+    run = (
+        loop.resume(recipe, weights, checkpoint, record)
+        if checkpoint
+        else loop.start(recipe, weights, record)
+    )
+    loop.train(
+        recipe,
+        run,
+        _source(tables, recipe),
+        objective=objective,
+        checkpoint=checkpoint,
+        progress=progress,
+        budget_seconds=budget_seconds,
+    )
+    free, layers = loop.result(run, recipe)
+    adapter = replace(_adapter(LIBRARY, recipe, run, record), layers=layers)
+    return Library(adapter, tuple(names), np.asarray(code_of(free))), run
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """The code (32,) of a new material, and its log loss over the bins of the table.
+
+    `nearest` is the material of the library that comes closest to it, `nearest_log_loss` what that one has.
+    """
+
+    code: NDArray[np.float32]
+    log_loss: float
+    nearest: str
+    nearest_log_loss: float
+
+
+def encode(
+    library: Library,
+    tables: Tables,
+    *,
+    recipe: Recipe = ENCODING,
+    progress: Callable[[loop.Run], None] = lambda run: None,
+) -> Encoded:
+    """Learns the code of the one material of `tables`, the network as it is.
+
+    The search starts at the mean code and at those of the nearest materials, all at once, and keeps the best.
+    """
+    if tables.values.shape != (1, *ISOTROPIC.shape):
+        raise TableError(f"one table {ISOTROPIC.shape} is encoded at a time, got {tables.values.shape}")
+    adapter = library.adapter
+    recipe = replace(
+        recipe, instances=adapter.instances, directional=adapter.directional, bounded=adapter.bounded
+    )
+    losses = _judge(library.codes, library, tables, recipe)
+    near = np.argsort(losses)[:NEAREST]
+    starts = np.concatenate([library.codes.mean(axis=0, keepdims=True), library.codes[near]])
+    weights = free_of(starts).astype(np.float32), adapter.layers
+    run = loop.start(recipe, weights)
+    loop.train(
+        recipe, run, _source(_repeated(tables, len(starts)), recipe), objective=_held, progress=progress
+    )
+    found = np.asarray(code_of(loop.result(run, recipe)[0]))
+    # The nearest code may already be the best.
+    found = np.concatenate([found, library.codes[near[:1]]])
+    best = found[np.argmin(_judge(found, library, tables, recipe))]
+    log_losses = [_log_loss(library, code, tables) for code in (best, library.codes[near[0]])]
+    return Encoded(best, log_losses[0], library.names[near[0]], log_losses[1])
+
+
+def code_of(free: Any) -> Any:
+    """Codes from what Adam moves, any real numbers: within the class's range, and hardly changed in its middle."""
+    return CODE_BOUND * jnp.tanh(free * (1.0 / CODE_BOUND))
+
+
+def free_of(code: NDArray) -> NDArray:
+    """Inverse of `code_of`, kept off the ends, where nothing moves any more."""
+    return CODE_BOUND * np.arctanh(np.clip(code / CODE_BOUND, -0.99, 0.99))
+
+
+def objective(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The loss of (codes before `code_of`, layers); the batch has the materials' numbers instead of parameters."""
+    free, layers = weights
+    codes = code_of(free)[batch.columns[0].astype(jnp.int32)]
+    return loss(layers, batch._replace(columns=codes.T), recipe)
+
+
+def _held(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The same, with a network that stays as it is."""
+    free, layers = weights
+    return objective((free, jax.lax.stop_gradient(layers)), batch, recipe)
+
+
+def _source(tables: Tables, recipe: Recipe) -> Callable[[int], Batch]:
+    """The batch of each step, with the number of each row's material as its only column."""
+    pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
+    pool.params = np.arange(len(tables.values), dtype=np.float32)[:, None]
+    return lambda step: draw(pool, sampler, recipe, step)
+
+
+def _repeated(tables: Tables, count: int) -> Tables:
+    """One material `count` times, without a copy."""
+    values = np.broadcast_to(tables.values, (count, *tables.values.shape[1:]))
+    return Tables(np.zeros((count, 1)), values, np.repeat(tables.walks, count))
+
+
+def _judge(codes: NDArray, library: Library, tables: Tables, recipe: Recipe) -> NDArray[np.float32]:
+    """The log loss of each code (n,), from the same few bins for all."""
+    source = _source(tables, replace(recipe, seed=recipe.seed + 1))
+    batches = Batch(*(np.stack(parts) for parts in zip(*map(source, range(_JUDGED)), strict=True)))
+    return np.asarray(_log_losses(jnp.asarray(codes), library.adapter.layers, batches, recipe))
+
+
+@partial(jax.jit, static_argnames="recipe")
+def _log_losses(codes: jax.Array, layers: Any, batches: Batch, recipe: Recipe) -> jax.Array:
+    def of_batch(code: jax.Array, batch: Batch) -> jax.Array:
+        columns: Any = jnp.broadcast_to(code[:, None], (len(code), len(batch.mu)))
+        batch = batch._replace(columns=columns)
+        return distance(bin_means(blend_of(layers, batch, recipe), batch, recipe), batch, recipe)[1]
+
+    def of_code(code: jax.Array) -> jax.Array:
+        return jax.lax.map(lambda batch: of_batch(code, batch), batches).mean()
+
+    return jax.lax.map(of_code, codes)
+
+
+def _log_loss(library: Library, code: NDArray, tables: Tables) -> float:
+    """The log loss over all bins."""
+    own = tabulate_adapter(library.adapter, code[None])[0]
+    return table_metrics(own, tables.values[0], np.zeros_like(own))["log_loss"]
