@@ -1,0 +1,292 @@
+"""A library of the 100 NBRDF-MERL materials in one small network, and its latent space (paper Fig. 12).
+
+    python figures/library/run.py [--quick] [--steps N] [--data FILE] [--new FILE] [--held-out N] [--size N] [--spp N]
+
+Trains as `nma train-library` does, compares each material with its table, learns the codes of materials that training
+has not seen, and renders mixtures of four. The networks of NBRDF-MERL and a measured material are no part of this
+repository: `--data` and `--new` say where they are. Tables, weights and pictures are kept in out/figures/library, so a
+killed run goes on. Prints library.md and writes it, library.json and library.png beside this file; with --quick, of a
+few BSDFs of Mitsuba's and with little training, to out/figures/library.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+import nma
+import nma.render
+from nma import collection
+from nma.cli.console import TrainingBar, progress
+from nma.collection import Member
+from nma.image_io import tonemap
+from nma.library import Library
+from nma.table import Tables
+from nma.train import library as training
+from nma.train.recipe import Recipe
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+import studio
+
+DATA = common.ROOT.parent / "shared/data"
+NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"
+NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
+# Top left, top right, bottom left, bottom right: a metal, a paint, a matte material and a plastic.
+CORNERS = ("brass", "color-changing-paint2", "pink-fabric", "green-plastic")
+CELLS = 7
+# Cosines in each row of a table at which an adapter runs to be compared with it.
+DIRECTIONS = 16
+# Correlated multi-jittered samples, as in figures/rendered.
+SAMPLER = "multijitter"
+QUICK = {
+    "conductor": '<bsdf type="roughconductor"><string name="material" value="Au"/></bsdf>',
+    "plastic": '<bsdf type="roughplastic"><rgb name="diffuse_reflectance" value=".1, .2, .6"/></bsdf>',
+    "matte": '<bsdf type="diffuse"><rgb name="reflectance" value=".7, .6, .5"/></bsdf>',
+    "red": '<bsdf type="principled"><rgb name="base_color" value=".6, .1, .1"/></bsdf>',
+    "new": '<bsdf type="principled"><rgb name="base_color" value=".1, .5, .2"/></bsdf>',
+}
+
+
+def main() -> None:
+    arguments = parse()
+    folder = common.results(__file__, arguments.quick)
+    kept = common.ROOT / "out/figures/library" / ("quick" if arguments.quick else "kept")
+    nma.render.use()
+    if arguments.quick:
+        write_quick(kept)
+    members, new = collection.members(arguments.data), Member(arguments.new.stem, arguments.new)
+    recipe = replace(training.RECIPE, **arguments.settings)
+    tables = tabulated(members, kept)
+    library, spent = trained("all", members, tables, recipe, kept)
+    rows = judged(library, tables, kept / f"all_{recipe.steps}.json")
+    encoded = [encoding(new.name, library, tabulated([new], kept), arguments.encoding_steps)]
+    held_out = unseen(members, tables, recipe, arguments, kept)
+    pictures, flips = rendered(library, members, arguments, kept)
+    data = {
+        "materials": len(members),
+        "origin": collection.origin(members),
+        "parameters": library.parameters,
+        "recipe": asdict(recipe),
+        "seconds": spent,
+        "fits": rows,
+        "encoded": encoded,
+        "held_out": held_out,
+        "flip": flips,
+    }
+    text = markdown(data)
+    print(text)
+    (folder / "library.md").write_text(text)
+    common.write_json(folder / "library.json", data)
+    sheet(pictures, flips, folder / "library.png")
+
+
+def parse() -> argparse.Namespace:
+    parser = common.parser(__doc__)
+    parser.add_argument("--steps", type=int, help="of training, instead of the recipe's")
+    parser.add_argument("--data", type=Path, default=NBRDF, help="the materials")
+    parser.add_argument("--new", type=Path, default=NEW, help="a material that is only encoded")
+    parser.add_argument(
+        "--held-out", type=int, default=10, help="materials that a second library does not see"
+    )
+    parser.add_argument("--size", type=int, default=96, help="of the pictures, in pixels")
+    parser.add_argument("--spp", type=int, default=256, help="samples per pixel of the mixtures")
+    parser.add_argument("--reference-spp", type=int, default=2048, help="of fits and references")
+    arguments = parser.parse_args()
+    vars(arguments).update(settings={}, encoding_steps=training.ENCODING.steps, corners=CORNERS)
+    if arguments.quick:
+        kept = common.ROOT / "out/figures/library/quick"
+        vars(arguments).update(data=kept / "materials", new=kept / "new.xml", held_out=0, size=24, spp=16)
+        vars(arguments).update(reference_spp=16, corners=tuple(QUICK)[:4], encoding_steps=100)
+        arguments.settings = {"steps": 200, "rows": 64, "points": 4, "albedo_samples": 2}
+    elif arguments.steps:
+        arguments.settings = {"steps": arguments.steps}
+    return arguments
+
+
+def write_quick(kept: Path) -> None:
+    """A few of Mitsuba's BSDFs in files, four to train on and one that is new."""
+    for name, bsdf in QUICK.items():
+        path = kept / ("new.xml" if name == "new" else f"materials/{name}.xml")
+        common.write_text(path, bsdf.replace("<bsdf", '<bsdf version="3.0.0"') + "\n")
+
+
+def tabulated(members: Sequence[Member], kept: Path) -> Tables:
+    bar = progress("materials/s")
+    with bar:
+        task = bar.add_task("tabulating", total=len(members), rate="", note="")
+        return collection.tables(members, kept / "tables", lambda done: bar.update(task, completed=done))
+
+
+def trained(
+    label: str, members: Sequence[Member], tables: Tables, recipe: Recipe, kept: Path
+) -> tuple[Library, float]:
+    """The library of these materials, and the seconds that its training took."""
+    path = kept / f"{label}_{recipe.steps}.safetensors"
+    if not path.exists():
+        record = {"data": collection.origin(members), "materials": len(members)}
+        names = [member.name for member in members]
+        checkpoint = path.with_suffix(".ckpt")
+        with TrainingBar(recipe, label) as bar:
+            made, _ = training.train_library(
+                names, tables, recipe, record, checkpoint=checkpoint, progress=bar.update
+            )
+        made.save(path)
+        checkpoint.unlink()
+    library = Library.load(path)
+    return library, library.adapter.training["seconds"]
+
+
+def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]:
+    """Log loss and albedo error of each material of the library, best first."""
+    known = Tables(library.codes.astype(np.float64), tables.values, tables.walks, tables.error)
+    found = common.kept(path, lambda: common.figures(library.adapter, known, DIRECTIONS))
+    wanted = ("log_loss", "albedo_error", "noise_floor")
+    rows = [
+        {"name": name} | {key: round(row[key], 6) for key in wanted}
+        for name, row in zip(library.names, found, strict=True)
+    ]
+    return sorted(rows, key=lambda row: row["log_loss"])
+
+
+def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[str, Any]:
+    """What a new material's code achieves."""
+    began = time.perf_counter()
+    found = training.encode(library, tables, recipe=replace(training.ENCODING, steps=steps))
+    row = {"name": name, "log_loss": round(found.log_loss, 6), "nearest": found.nearest}
+    row |= {"nearest_log_loss": round(found.nearest_log_loss, 6)}
+    print(f"{name}: {row}", flush=True)
+    return row | {"seconds": round(time.perf_counter() - began, 1)}
+
+
+def unseen(
+    members: Sequence[Member], tables: Tables, recipe: Recipe, arguments: argparse.Namespace, kept: Path
+) -> list[dict[str, Any]]:
+    """Codes of materials that a second library has not seen: evenly chosen ones."""
+    if not arguments.held_out:
+        return []
+    out = np.linspace(0, len(members), arguments.held_out, endpoint=False).astype(int) + 1
+    rest = np.setdiff1d(np.arange(len(members)), out)
+    library, _ = trained(f"without_{len(out)}", [members[k] for k in rest], tables[rest], recipe, kept)
+    steps = arguments.encoding_steps
+    path = kept / f"without_{len(out)}_{recipe.steps}_encoded_{steps}.json"
+    return common.kept(
+        path, lambda: [encoding(members[k].name, library, tables[k : k + 1], steps) for k in out]
+    )
+
+
+def rendered(
+    library: Library, members: Sequence[Member], arguments: argparse.Namespace, kept: Path
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The grid of mixtures (CELLS, CELLS), references and fits of the corners; FLIP of each fit, and of noise alone."""
+    by_name = {member.name: member for member in members}
+    size, many = arguments.size, arguments.reference_spp
+    codes = np.stack([library.code(name) for name in arguments.corners])
+    grid = []
+    for v in np.linspace(0.0, 1.0, CELLS):
+        for u in np.linspace(0.0, 1.0, CELLS):
+            shares = np.array([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
+            corner = shares.max() == 1.0
+            bsdf = fit(library, shares @ codes, kept)
+            grid.append(studio.render(bsdf, size, many if corner else arguments.spp, 1, SAMPLER))
+    fits = [grid[k] for k in (0, CELLS - 1, CELLS * (CELLS - 1), CELLS * CELLS - 1)]
+    references, flips = [], []
+    for name, own in zip(arguments.corners, fits, strict=True):
+        bsdf = measured(by_name[name])
+        reference, again = (studio.render(bsdf, size, many, seed, SAMPLER) for seed in (2, 3))
+        errors, noise = (nma.compare_images(image, reference) for image in (own, again))
+        references.append(reference)
+        row = {"name": name} | {key: round(errors[key], 5) for key in ("flip_ldr", "flip_hdr")}
+        flips.append(row | {f"noise_{key}": round(noise[key], 5) for key in ("flip_ldr", "flip_hdr")})
+        print(flips[-1], flush=True)
+    return {"grid": grid, "references": references}, flips
+
+
+def fit(library: Library, code: NDArray, kept: Path) -> dict[str, Any]:
+    """The BSDF of a code."""
+    path = kept / "mixture.safetensors"
+    library.material(code).save(path)
+    return {"type": "nma", "adapter": str(path)}
+
+
+def measured(member: Member) -> dict[str, Any]:
+    """The BSDF of a material itself."""
+    chosen = {"material": member.material} if member.material else {}
+    return {"type": "values", "file": str(member.path)} | chosen
+
+
+def markdown(data: dict[str, Any]) -> str:
+    """The tables of README.md."""
+    losses = [row["log_loss"] for row in data["fits"]]
+    albedos = [row["albedo_error"] for row in data["fits"]]
+    worst = data["fits"][-1]
+    lines = [
+        f"{data['materials']} materials ({data['origin']}), {data['parameters']:,} parameters, "
+        f"{data['recipe']['steps']} steps in {data['seconds']:.0f} s.",
+        "",
+        "| | mean | median | worst |",
+        "|---|---|---|---|",
+        f"| log loss | {np.mean(losses):.5f} | {np.median(losses):.5f} | {max(losses):.5f} ({worst['name']}) |",
+        f"| albedo error | {np.mean(albedos):.5f} | {np.median(albedos):.5f} | {max(albedos):.5f} |",
+        "",
+        "Codes of new materials:",
+        "",
+        "| material | log loss | nearest of the library | its log loss | seconds |",
+        "|---|---|---|---|---|",
+    ]
+    found = data["encoded"] + data["held_out"]
+    lines += [
+        f"| {row['name']} | {row['log_loss']:.5f} | {row['nearest']} | {row['nearest_log_loss']:.5f} "
+        f"| {row['seconds']} |"
+        for row in found
+    ]
+    lines += ["", "Corners of the grid, against their references:", ""]
+    lines += ["| material | FLIP | HDR-FLIP | FLIP of noise | HDR-FLIP of noise |", "|---|---|---|---|---|"]
+    keys = ("flip_ldr", "flip_hdr", "noise_flip_ldr", "noise_flip_hdr")
+    lines += [
+        f"| {row['name']} | " + " | ".join(f"{row[key]:.4f}" for key in keys) + " |" for row in data["flip"]
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def sheet(pictures: dict[str, Any], flips: list[dict[str, Any]], path: Path) -> None:
+    """The grid, with the references beside its corners and the FLIP of the fits below them."""
+    figure = Figure(figsize=(12.6, 10.2), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
+    axes = figure.subplots(CELLS, CELLS + 2)
+    for place in axes.flat:
+        place.set_axis_off()
+    for k, image in enumerate(pictures["grid"]):
+        show(axes[k // CELLS, k % CELLS + 1], image)
+    for k, (image, row) in enumerate(zip(pictures["references"], flips, strict=True)):
+        place = axes[(CELLS - 1) * (k // 2), (CELLS + 1) * (k % 2)]
+        show(place, image)
+        place.set_title(f"{row['name']}\nreference", fontsize=8)
+        place.text(
+            0.5,
+            -0.06,
+            f"its fit: FLIP {row['flip_ldr']:.4f}\n(noise {row['noise_flip_ldr']:.4f})",
+            transform=place.transAxes,
+            ha="center",
+            va="top",
+            fontsize=8,
+        )
+    figure.savefig(path, dpi=130)
+    print(f"{path}")
+
+
+def show(axes: Any, image: NDArray[np.float32]) -> None:
+    axes.imshow(tonemap(image, shoulder=0.8), interpolation="lanczos")
+
+
+if __name__ == "__main__":
+    main()
