@@ -18,8 +18,8 @@ from nma.params import LAYERED3, LIBRARY
 from nma.runtime import Runtime
 from nma.sources.merl import SHAPE, Merl
 from nma.table import ISOTROPIC, Tables
-from nma.train import library as training
 from nma.target import PRINCIPLED_PARAMS
+from nma.train import library as training
 from nma.train import loop
 
 COLOURS = np.array([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.5, 0.5, 0.9], [0.5, 0.4, 0.2]])
