@@ -27,16 +27,17 @@ NAMES = ("red", "green", "blue")
 TINY = replace(
     training.RECIPE,
     network="2x16",
-    rows=24,
-    bins_per_row=8,
-    points=4,
-    albedo_samples=2,
+    bounded=False,
+    rows=64,
+    bins_per_row=4,
+    points_law="centre",
+    albedo=0.0,
     learning_rate=2e-2,
     average=0.9,
-    steps=300,
+    steps=250,
 )
-# What 300 steps must reach; a library of greys has .045.
-REACHED = 0.008
+# What 250 steps must reach; they start above .02.
+REACHED = 0.003
 
 
 def matte(rho):
@@ -141,10 +142,9 @@ def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
     for (matrix, bias), (before, bias_before) in zip(library.adapter.layers, layers, strict=True):
         np.testing.assert_array_equal(matrix, before)
         np.testing.assert_array_equal(bias, bias_before)
-    # One that the library knows is found again.
-    known = training.encode(library, tables[1:2], recipe=recipe)
-    assert known.nearest == "green"
-    assert known.log_loss <= known.nearest_log_loss * 1.05
+    # Each that the library knows is nearest to itself.
+    nearest = [np.argmin(training._judge(library.codes, library, tables[k : k + 1], recipe)) for k in range(3)]
+    assert nearest == [0, 1, 2]
     with pytest.raises(TableError, match="one table"):
         training.encode(library, tables, recipe=recipe)
 

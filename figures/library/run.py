@@ -107,7 +107,7 @@ def parse() -> argparse.Namespace:
         kept = common.ROOT / "out/figures/library/quick"
         vars(arguments).update(data=kept / "materials", new=kept / "new.xml", held_out=0, size=24, spp=16)
         vars(arguments).update(reference_spp=16, corners=tuple(QUICK)[:4], encoding_steps=100)
-        arguments.settings = {"steps": 200, "rows": 64, "points": 4, "albedo_samples": 2}
+        arguments.settings = {"steps": 200, "rows": 64, "points": 4, "albedo_samples": 2, "average": 0.9}
     elif arguments.steps:
         arguments.settings = {"steps": arguments.steps}
     return arguments
@@ -259,27 +259,22 @@ def markdown(data: dict[str, Any]) -> str:
 
 
 def sheet(pictures: dict[str, Any], flips: list[dict[str, Any]], path: Path) -> None:
-    """The grid, with the references beside its corners and the FLIP of the fits below them."""
-    figure = Figure(figsize=(12.6, 10.2), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
+    """The grid, with the references beside its corners, and towards the middle the FLIP of the fits."""
+    figure = Figure(figsize=(1.4 * (CELLS + 2), 1.4 * CELLS))
     axes = figure.subplots(CELLS, CELLS + 2)
+    figure.subplots_adjust(left=0.003, right=0.997, bottom=0.003, top=0.997, wspace=0.03, hspace=0.03)
     for place in axes.flat:
         place.set_axis_off()
     for k, image in enumerate(pictures["grid"]):
         show(axes[k // CELLS, k % CELLS + 1], image)
     for k, (image, row) in enumerate(zip(pictures["references"], flips, strict=True)):
-        place = axes[(CELLS - 1) * (k // 2), (CELLS + 1) * (k % 2)]
+        top = k < 2
+        place = axes[0 if top else -1, (CELLS + 1) * (k % 2)]
         show(place, image)
-        place.set_title(f"{row['name']}\nreference", fontsize=8)
-        place.text(
-            0.5,
-            -0.06,
-            f"its fit: FLIP {row['flip_ldr']:.4f}\n(noise {row['noise_flip_ldr']:.4f})",
-            transform=place.transAxes,
-            ha="center",
-            va="top",
-            fontsize=8,
-        )
+        errors = f"FLIP of its fit: {row['flip_ldr']:.4f}\nof noise: {row['noise_flip_ldr']:.4f}"
+        words = f"{row['name']}\n(reference)\n\n{errors}"
+        at, anchor = (-0.06, "top") if top else (1.06, "bottom")
+        place.text(0.5, at, words, transform=place.transAxes, ha="center", va=anchor, fontsize=8)
     figure.savefig(path, dpi=130)
     print(f"{path}")
 

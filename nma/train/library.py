@@ -175,20 +175,18 @@ def _judge(codes: NDArray, library: Library, tables: Tables, recipe: Recipe) -> 
     """The log loss of each code (n,), from the same few bins for all."""
     source = _source(tables, replace(recipe, seed=recipe.seed + 1))
     batches = Batch(*(np.stack(parts) for parts in zip(*map(source, range(_JUDGED)), strict=True)))
-    return np.asarray(_log_losses(jnp.asarray(codes), library.adapter.layers, batches, recipe))
+    layers = library.adapter.layers
+    return np.array([_sampled_log_loss(jnp.asarray(code), layers, batches, recipe) for code in codes])
 
 
 @partial(jax.jit, static_argnames="recipe")
-def _log_losses(codes: jax.Array, layers: Any, batches: Batch, recipe: Recipe) -> jax.Array:
-    def of_batch(code: jax.Array, batch: Batch) -> jax.Array:
+def _sampled_log_loss(code: jax.Array, layers: Any, batches: Batch, recipe: Recipe) -> jax.Array:
+    def of_batch(batch: Batch) -> jax.Array:
         columns: Any = jnp.broadcast_to(code[:, None], (len(code), len(batch.mu)))
         batch = batch._replace(columns=columns)
         return distance(bin_means(blend_of(layers, batch, recipe), batch, recipe), batch, recipe)[1]
 
-    def of_code(code: jax.Array) -> jax.Array:
-        return jax.lax.map(lambda batch: of_batch(code, batch), batches).mean()
-
-    return jax.lax.map(of_code, codes)
+    return jax.lax.map(of_batch, batches).mean()
 
 
 def _log_loss(library: Library, code: NDArray, tables: Tables) -> float:
