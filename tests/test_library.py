@@ -27,6 +27,7 @@ NAMES = ("red", "green", "blue")
 TINY = replace(
     training.RECIPE,
     network="2x16",
+    instances=1,
     bounded=False,
     rows=64,
     bins_per_row=4,
@@ -165,7 +166,7 @@ def test_mixtures_and_single_materials(library):
 
 def test_the_runtime_in_cpp_reads_a_library(compiler, library, saved):
     runtime = Runtime(saved)
-    assert (runtime.parameters, runtime.size) == (32, 23)
+    assert (runtime.parameters, runtime.size) == (32, library.adapter.size)
     mu = np.linspace(0.05, 1.0, 30, dtype=np.float32)
     codes = np.repeat(library.codes[:1], 30, axis=0)
     inputs = np.concatenate([codes, mu[:, None]], axis=1)
