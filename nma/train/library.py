@@ -23,7 +23,7 @@ from nma.train import loop
 from nma.train.data import Batch, BinSampler, Pool, draw
 from nma.train.loss import bin_means, blend_of, distance, loss
 from nma.train.recipe import Recipe
-from nma.train.run import _adapter, initial_layers
+from nma.train.run import adapter_of, initial_layers
 
 # 20 minutes or less on two cores for a hundred materials, tables included.
 RECIPE = Recipe(
@@ -85,7 +85,7 @@ def train_library(
         budget_seconds=budget_seconds,
     )
     free, layers = loop.result(run, recipe)
-    adapter = replace(_adapter(LIBRARY, recipe, run, record), layers=layers)
+    adapter = replace(adapter_of(LIBRARY, recipe, run, record), layers=layers)
     return Library(adapter, tuple(names), np.asarray(code_of(free))), run
 
 
