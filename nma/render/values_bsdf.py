@@ -1,6 +1,7 @@
 """Mitsuba 3 BSDF `values`: a source that knows its value, such as a measurement, as it is, without an adapter.
 
-Properties: `file`, anything that `nma.sources.read` understands, and `material`, which chooses in a file of several.
+Properties: `file`, anything that `nma.sources.read` understands, and `material`, which chooses in a file of several; or
+`source`, the number of one in memory, which `bsdf_of` gives out.
 Isotropic or not, one-sided, the same everywhere on a surface. Directions are drawn from a fixed mixture of lobes, a
 cosine and three reflections, whatever the material: unbiased, but a reference for converged pictures, not a fast one.
 """
@@ -13,6 +14,7 @@ from typing import Any
 from nma import sources, target
 from nma.ops import Color, Vec3
 from nma.render.layered import check_variant
+from nma.sources.base import Values
 from nma.target import Blend, Principled
 
 # Widths of the reflections that directions are drawn from, beside the cosine.
@@ -29,6 +31,16 @@ _PROPOSAL = Blend(
     (1.0 / (len(_ALPHAS) + 1),) * (len(_ALPHAS) + 1),
 )
 
+# Sources that scenes refer to by their place, as descriptions of scenes hold no objects of Python.
+_IN_MEMORY: list[Values] = []
+
+
+def bsdf_of(source: Values) -> dict[str, Any]:
+    """The Mitsuba dictionary of a source in memory, which is kept for as long as the program runs."""
+    if source not in _IN_MEMORY:
+        _IN_MEMORY.append(source)
+    return {"type": "values", "source": _IN_MEMORY.index(source)}
+
 
 def define() -> type:
     """The plugin's class for Mitsuba's present variant."""
@@ -42,14 +54,18 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             check_variant(mi.variant(), props.plugin_name())
-            # Files lie beside the scene, as those of Mitsuba's own plugins do.
-            path = str(mi.file_resolver().resolve(str(props["file"])))
-            self.values = sources.read(path, str(props["material"]) if "material" in props else None)
+            self.values = _IN_MEMORY[int(props["source"])] if "source" in props else self._read(props)
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             if not self.values.isotropic:
                 flags |= mi.BSDFFlags.Anisotropic
             self.m_components = [flags]
             self.m_flags = flags
+
+        @staticmethod
+        def _read(props: mi.Properties) -> Values:
+            # Files lie beside the scene, as those of Mitsuba's own plugins do.
+            path = str(mi.file_resolver().resolve(str(props["file"])))
+            return sources.read(path, str(props["material"]) if "material" in props else None)
 
         def to_string(self) -> str:
             return f"Values[\n  source = {self.values.name}\n]"

@@ -1,0 +1,255 @@
+"""Single materials from any source: measured, analytic, isotropic or not, against the alternatives (paper Fig. 13).
+
+    python figures/measured/run.py [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
+
+Fits each material as `nma fit` does with a 3x32 network, and compares the fit with the material itself at 20,000 random
+pairs of directions and in a picture; beside it the best constant Principled BRDF, and for RGL's measurements the NBRDF
+network that its authors fitted to the same material. RGL's files and NBRDF's networks are no part of this repository:
+`--data` says where they are (folders `rgl` and `rgl_nbrdf`), without them they are left out. Writes measured.md,
+measured.json and measured.png beside this file; with --quick, with little training, to out/figures/measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from matplotlib import colormaps
+
+import nma
+import nma.render
+from nma import network
+from nma.adapter import Adapter
+from nma.cli.console import TrainingBar
+from nma.contact_sheet import Row, contact_sheet
+from nma.image_metrics import flip_map
+from nma.pairs import Pairs, compare
+from nma.render.values_bsdf import bsdf_of
+from nma.sources.adapter import AdapterValues
+from nma.sources.base import Values
+from nma.sources.coating import Coating
+from nma.sources.mitsuba_bsdf import from_dict
+from nma.sources.nbrdf import WEIGHTS, Nbrdf
+from nma.tabulation import tabulate_values
+from nma.train.constant import CONSTANT, fit_constant
+from nma.train.fit import recipe_for
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+import studio
+
+DATA = common.ROOT.parent / "shared/data"
+RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")
+# What was published of NBRDF holds without the grazing directions in which measurements are hardest to follow.
+RANGES = {"": (0.02, 1.0), " from .05": (0.05, 1.0)}
+TIMED_PAIRS = 1 << 18
+SAMPLER = "multijitter"
+PLASTIC = {
+    "type": "roughplastic",
+    "alpha": 0.15,
+    "diffuse_reflectance": {"type": "rgb", "value": [0.05, 0.2, 0.5]},
+}
+BRUSHED = {
+    "type": "roughconductor",
+    "material": "Cu",
+    "distribution": "ggx",
+    "alpha_u": 0.08,
+    "alpha_v": 0.35,
+}
+
+
+class Material(NamedTuple):
+    """A source, the BSDF that renders it as it is, and the NBRDF network of the same material, if there is one."""
+
+    name: str
+    source: Values
+    bsdf: dict[str, Any]
+    nbrdf: Nbrdf | None = None
+
+
+def main() -> None:
+    arguments = parse()
+    folder = common.results(__file__, arguments.quick)
+    kept = common.ROOT / "out/figures/measured" / ("quick" if arguments.quick else "kept")
+    nma.render.use()
+    known = {m.name: m for m in materials(arguments.data)}
+    if unknown := set(arguments.materials) - set(known):
+        sys.exit(f"no material {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    chosen = [m for name, m in known.items() if not arguments.materials or name in arguments.materials]
+    rows, pictures = [], []
+    for material in chosen:
+        adapter, seconds = fitted(material, arguments.steps, kept)
+        row = judged(material, adapter, seconds, arguments.constant_steps)
+        own, errors = rendered(material, adapter, kept, arguments)
+        rows.append(row | errors)
+        pictures.append(Row(material.name, own, ("itself", "fit", f"FLIP {errors['flip_ldr']:.4f}")))
+        print(rows[-1], flush=True)
+    text = markdown(rows)
+    print(text)
+    common.write_text(folder / "measured.md", text)
+    common.write_json(folder / "measured.json", rows)
+    contact_sheet(folder / "measured.png", pictures, ("material", "3x32 fit", "FLIP of the fit"))
+
+
+def parse() -> argparse.Namespace:
+    parser = common.parser(__doc__)
+    parser.add_argument("materials", nargs="*")
+    parser.add_argument("--steps", type=int, help="of training, instead of the recipe's")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder with rgl and rgl_nbrdf")
+    parser.add_argument("--size", type=int, default=160, help="of the pictures, in pixels")
+    parser.add_argument("--spp", type=int, default=1024, help="samples per pixel")
+    arguments = parser.parse_args()
+    arguments.constant_steps = CONSTANT.steps
+    if arguments.quick:
+        vars(arguments).update(
+            steps=50, constant_steps=20, size=24, spp=16, materials=["coating", "brushed copper"]
+        )
+    return arguments
+
+
+def materials(data: Path) -> list[Material]:
+    """RGL's where there are copies, then the analytic ones."""
+    found = []
+    for name in RGL:
+        path, networks = data / f"rgl/{name}_rgb.bsdf", data / "rgl_nbrdf/rgl-isotropic_nbrdf_weights.npz"
+        if path.is_file():
+            nbrdf = Nbrdf.load(networks, f"{name}_rgb") if networks.is_file() else None
+            found.append(
+                Material(name, nma.read_values(path), {"type": "measured", "filename": str(path)}, nbrdf)
+            )
+        else:
+            print(
+                f"{name} is left out: there is no {path}; `nma data` says where it comes from",
+                file=sys.stderr,
+            )
+    coating = Coating(conductor="Au", alpha_metal=0.3, alpha=0.03, absorption=(0.02, 0.1, 0.3))
+    found.append(Material("coating", coating, bsdf_of(coating)))
+    for name, bsdf in (("rough plastic", PLASTIC), ("brushed copper", BRUSHED)):
+        found.append(Material(name, from_dict(bsdf, name), bsdf))
+    return found
+
+
+def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, float]:
+    """The adapter as `nma fit` makes it, and the seconds that took, compilation included."""
+    recipe = recipe_for(material.source, steps=steps)
+    path = kept / f"{material.name.replace(' ', '-')}_{recipe.steps}.safetensors"
+    if not path.exists():
+        began = time.perf_counter()
+        with TrainingBar(recipe, material.name) as bar:
+            adapter, _ = nma.fit(material.source, recipe, progress=bar.update)
+        adapter.training["wall_seconds"] = round(time.perf_counter() - began, 1)
+        adapter.save(path)
+    adapter = Adapter.load(path)
+    return adapter, adapter.training["wall_seconds"]
+
+
+def judged(material: Material, adapter: Adapter, seconds: float, constant_steps: int) -> dict[str, Any]:
+    """Figures, sizes and times of the fit and of its alternatives."""
+    own = AdapterValues(adapter)
+    row: dict[str, Any] = {"name": material.name, "seconds": seconds}
+    row |= figures("fit", own, network.parameters(adapter.layers), material.source)
+    if material.source.isotropic:
+        recipe = replace(CONSTANT, steps=constant_steps)
+        constant = fit_constant(tabulate_values(material.source), recipe).adapter
+        row |= figures("constant", AdapterValues(constant), constant.size, material.source)
+    if material.nbrdf is not None:
+        row |= figures("nbrdf", material.nbrdf, WEIGHTS, material.source)
+    return row
+
+
+def figures(label: str, model: Values, parameters: int, source: Values) -> dict[str, Any]:
+    """A model's figures against the source in each range of directions, its size, and its time per pair."""
+    found: dict[str, Any] = {f"{label} parameters": parameters, f"{label} ns": round(nanoseconds(model), 1)}
+    for words, cosines in RANGES.items():
+        pairs = Pairs.draw(seed=2, cosines=cosines)
+        found |= {f"{label} {k}{words}": round(v, 6) for k, v in compare(model, source, pairs).items()}
+    return found
+
+
+def nanoseconds(model: Values, repetitions: int = 5) -> float:
+    """Best time of a pair of directions among many at once, on all cores, compilation apart."""
+    rng = np.random.default_rng(0)
+    lanes = [dr.auto.Float(rng.random(TIMED_PAIRS).astype(np.float32)) for _ in range(4)]
+
+    def direction(mu: Any, turn: Any) -> nma.ops.Vec3:
+        sin = dr.sqrt(1.0 - mu * mu)
+        return nma.ops.Vec3(sin * dr.cos(6.2831853 * turn), sin * dr.sin(6.2831853 * turn), mu)
+
+    wi, wo = direction(*lanes[:2]), direction(*lanes[2:])
+    dr.eval(wi, wo)
+    times = []
+    for _ in range(repetitions + 1):
+        began = time.perf_counter()
+        value = model.eval(wi, wo)
+        dr.eval(value)
+        dr.sync_thread()
+        times.append(time.perf_counter() - began)
+    return min(times[1:]) / TIMED_PAIRS * 1e9
+
+
+def rendered(
+    material: Material, adapter: Adapter, kept: Path, arguments: argparse.Namespace
+) -> tuple[list[Any], dict[str, float]]:
+    """The material, its fit and the map of their FLIP; and the FLIP of the fit, and of noise alone."""
+    path = kept / "rendered.safetensors"
+    adapter.save(path)
+    bsdfs = (material.bsdf, material.bsdf, {"type": "nma", "adapter": str(path)})
+    reference, again, own = (
+        studio.render(bsdf, arguments.size, arguments.spp, seed, SAMPLER)
+        for seed, bsdf in enumerate(bsdfs, 1)
+    )
+    errors, noise = (nma.compare_images(image, reference) for image in (own, again))
+    found = {key: round(errors[key], 5) for key in ("flip_ldr", "flip_hdr")}
+    found |= {f"noise_{key}": round(noise[key], 5) for key in ("flip_ldr", "flip_hdr")}
+    return [reference, own, flip_picture(flip_map(own, reference))], found
+
+
+def flip_picture(errors: np.ndarray) -> np.ndarray:
+    """A map of FLIP, 0 to 1, as bytes in the colours that its authors use."""
+    return (colormaps["magma"](np.clip(errors, 0.0, 1.0))[..., :3] * 255.0).astype(np.uint8)
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """The tables of README.md."""
+    models = {"fit": "3x32 fit", "nbrdf": "NBRDF", "constant": "constant Principled"}
+    head = "| material | model | log loss | AE | SMAPE | log loss from .05 | parameters | ns a pair |"
+    lines = [head, "|---|---|---|---|---|---|---|---|"]
+    for row in rows:
+        for label, words in models.items():
+            if f"{label} ns" in row:
+                values = [f"{row[f'{label} {key}']:.4f}" for key in ("log_loss", "ae")]
+                values += [f"{row[f'{label} smape']:.3f}", f"{row[f'{label} log_loss from .05']:.4f}"]
+                values += [f"{row[f'{label} parameters']:,}", f"{row[f'{label} ns']:.1f}"]
+                lines.append(f"| {row['name']} | {words} | {' | '.join(values)} |")
+    lines += means([row for row in rows if "nbrdf ns" in row])
+    lines += ["", "| material | seconds of the fit | FLIP | HDR-FLIP | FLIP of noise | HDR-FLIP of noise |"]
+    lines += ["|---|---|---|---|---|---|"]
+    keys = ("flip_ldr", "flip_hdr", "noise_flip_ldr", "noise_flip_hdr")
+    lines += [
+        f"| {row['name']} | {row['seconds']:.0f} | " + " | ".join(f"{row[key]:.4f}" for key in keys) + " |"
+        for row in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def means(rows: list[dict[str, Any]]) -> list[str]:
+    """Mean log losses of what NBRDF has, too."""
+    if not rows:
+        return []
+    lines = ["", f"Mean log loss of the {len(rows)} that have NBRDF networks:", ""]
+    for words, name in (("", "over [.02, 1]"), (" from .05", "over [.05, 1]")):
+        fit, nbrdf = (
+            np.mean([row[f"{label} log_loss{words}"] for row in rows]) for label in ("fit", "nbrdf")
+        )
+        lines.append(f"- {name}: fit {fit:.5f}, NBRDF {nbrdf:.5f}")
+    return lines
+
+
+if __name__ == "__main__":
+    main()
