@@ -90,17 +90,18 @@ public:
     static Adapter from_memory(const void* bytes, std::size_t size, const Options& options = {}) { return Adapter(parse_weights(bytes, size), options); }
 
     // Numbers that `prepare` takes, in the order of `parameters`.
-    int parameter_count() const { return parameter_count_; }
+    int parameter_count() const { return recipe_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
     // Numbers that describe a blend, and what the network returns for them.
-    int output_count() const { return output_count_; }
+    int output_count() const { return recipe_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
     // The blend for the parameters of the source material at cos(theta_i).
     Material prepare(const float* parameters, float cos_theta_i) const {
-        alignas(64) float numbers[WIDEST_LAYER + 1];
-        network_outputs(parameters, cos_theta_i, numbers);
-        return decoded(numbers, cos_theta_i);
+        Material made;
+        made.in_plane_ = in_plane_;
+        kernels().prepare(recipe_, parameters, cos_theta_i, made.blend_);
+        return made;
     }
 
     // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
@@ -108,16 +109,20 @@ public:
         alignas(64) float outputs[BLOCK * WIDEST_LAYER + 1];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
-            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count_, cos_theta_i + first, outputs);
+            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count(), cos_theta_i + first, outputs);
             // The last one first: a material's numbers end where those of the next query begin.
-            for (int q = now - 1; q >= 0; --q) materials[first + q] = decoded(outputs + q * network_.output_stride(), cos_theta_i[first + q]);
+            for (int q = now - 1; q >= 0; --q) {
+                Material& made = materials[first + q];
+                made.in_plane_ = in_plane_;
+                kernels().finish(recipe_, outputs + q * network_.output_stride(), cos_theta_i[first + q], made.blend_);
+            }
         }
     }
 
     // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
     void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
         alignas(64) float inputs[WIDEST_LAYER + LANES];
-        encode(parameters, cos_theta_i, inputs);
+        kernels().encode(recipe_, parameters, cos_theta_i, inputs);
         network_.forward(inputs, raw);
     }
 
@@ -126,35 +131,29 @@ public:
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
-            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count_, cos_theta_i + first, outputs);
+            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count(), cos_theta_i + first, outputs);
             for (int q = 0; q < now; ++q)
-                std::copy_n(outputs + q * network_.output_stride(), output_count_, raw + static_cast<std::size_t>(first + q) * output_count_);
+                std::copy_n(outputs + q * network_.output_stride(), output_count(), raw + static_cast<std::size_t>(first + q) * output_count());
         }
     }
 
 private:
     friend class Curves;
 
-    enum class Encoding { Raw, Direction, Layered3 };
-
     Adapter(Weights weights, const Options& options) : weights_(std::move(weights)), network_(weights_.layers, options.set, options.compact) {
-        for (const SourceParam& p : weights_.parameters) parameter_count_ += p.size;
         for (const TargetParam& p : weights_.target) add_fields(p);
-        encoding_ = encoding_named(weights_.encoding);
-        output_count_ = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
+        recipe_.encoding = Encoding(weights_);
+        recipe_.network = network_.view();
+        recipe_.instances = weights_.instances;
+        recipe_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
+        recipe_.bounded = weights_.bounded;
         check();
-        if (encoding_ == Encoding::Layered3) scale_ = scale_of(weights_.parameters);
         lay_out_ranges();
         lay_out_lanes();
         weights_.layers.clear();
     }
 
-    static Encoding encoding_named(const std::string& name) {
-        if (name == "raw") return Encoding::Raw;
-        if (name == "direction") return Encoding::Direction;
-        if (name == "layered3") return Encoding::Layered3;
-        throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
-    }
+    const Kernels& kernels() const { return network_.kernels_in_use(); }
 
     // Remembers which fields of a `Principled` the numbers of a parameter become.
     void add_fields(const TargetParam& p) {
@@ -178,19 +177,16 @@ private:
     void check() const {
         if (weights_.dialect != DIALECT) throw Error("written for the Principled dialect '" + weights_.dialect + "', not '" + DIALECT + "'");
         if (weights_.instances > MAX_INSTANCES) throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
-        const int expected = encoding_ == Encoding::Direction ? 1 : encoding_ == Encoding::Raw ? parameter_count_ + weights_.directional
-                                                                                                : 13 + 3 * weights_.directional;
-        if (encoding_ == Encoding::Layered3 && (parameter_count_ != 13 || weights_.parameters.size() != 7)) throw Error("the encoding 'layered3' belongs to another class");
-        if (weights_.layers.front().in != expected || weights_.layers.back().out != output_count_)
+        if (weights_.layers.front().in != recipe_.encoding.size() || weights_.layers.back().out != output_count())
             throw Error("the network does not fit its description; train again");
     }
 
     // The ranges of all outputs, of instance after instance; shares of the blend lie in 0 .. 1.
     void lay_out_ranges() {
         const int count = network_.output_stride();
-        ranges_memory_ = detail::aligned<float>(4 * static_cast<std::size_t>(count));
-        float *low = ranges_memory_.get(), *span = low + count, *log = span + count, *in_plane = log + count;
-        ranges_ = {count, false, low, span, log, in_plane};
+        ranges_ = detail::aligned<float>(4 * static_cast<std::size_t>(count));
+        float *low = ranges_.get(), *span = low + count, *log = span + count, *in_plane = log + count;
+        recipe_.ranges = {count, false, low, span, log, in_plane};
         int next = 0;
         for (int k = 0; k < weights_.instances; ++k)
             for (const TargetParam& p : weights_.target)
@@ -199,122 +195,30 @@ private:
                     span[next] = static_cast<float>(p.logarithmic ? std::log(p.high / p.low) : p.high - p.low);
                     log[next] = p.logarithmic;
                     in_plane[next] = p.in_plane;
-                    ranges_.any_log |= p.logarithmic;
+                    recipe_.ranges.any_log |= p.logarithmic;
                 }
         std::fill(span + next, span + count, 1.0f);
     }
 
-    // Which number each lane of each field takes; those without one take the number after all others, which is 0.
     void lay_out_lanes() {
         const int size = static_cast<int>(fields_.size()), per_pack = Blend<float>::FIELDS * LANES;
-        lane_index_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, network_.output_stride());
+        lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, network_.output_stride());
         for (int k = 0; k < weights_.instances; ++k)
-            for (int f = 0; f < size; ++f) lane_index_[k / LANES * per_pack + fields_[f] * LANES + k % LANES] = k * size + f;
+            for (int f = 0; f < size; ++f) lanes_[k / LANES * per_pack + fields_[f] * LANES + k % LANES] = k * size + f;
+        recipe_.lanes = lanes_.data();
     }
 
     void outputs_of_block(int count, const float* parameters, const float* cos_theta_i, float* outputs) const {
         alignas(64) float inputs[BLOCK * WIDEST_LAYER + LANES];
-        for (int q = 0; q < count; ++q) encode(parameters + q * parameter_count_, cos_theta_i[q], inputs + q * network_.input_stride());
+        for (int q = 0; q < count; ++q) kernels().encode(recipe_, parameters + q * parameter_count(), cos_theta_i[q], inputs + q * network_.input_stride());
         network_.forward_many(count, inputs, outputs);
-    }
-
-    // Twin of nma/encoding.py. Inputs beyond the encoding's own, up to the network's stride, become 0.
-    void encode(const float* p, float cosine, float* x) const {
-        float* const end = x + network_.input_stride();
-        if (encoding_ == Encoding::Direction) {
-            *x++ = weights_.directional ? 2.0f * cosine - 1.0f : 1.0f;
-        } else if (encoding_ == Encoding::Raw) {
-            x = std::copy_n(p, parameter_count_, x);
-            if (weights_.directional) *x++ = cosine;
-        } else {
-            x = encode_layered3(p, cosine, x);
-        }
-        std::fill(x, end, 0.0f);
-    }
-
-    float* encode_layered3(const float* p, float cosine, float* x) const {
-        using Four = Lanes<float>;
-        constexpr float GRAZING = 0.1045f;
-        const float sigma_t = p[12];
-        const Four one(1.0f), inside(1.0f / p[2]);
-        const Four plain{p[0], p[1], p[2], sigma_t};
-        const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * scale_.log;
-        // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
-        const Four n = Four(p[3], p[4], p[5], 1.0f) * inside, k = Four(p[6], p[7], p[8], 0.0f) * inside, k2 = k * k;
-        const Four less = n - one, more = n + one;
-        x = put(x, (bent - scale_.start) * scale_.per_range, 4);
-        x = put(x, (less * less + k2) / (more * more + k2), 3);
-        x = put(x, fresnel_conductor<Four>(Four(GRAZING), n, k), 3);
-        x = put(x, {p[9], p[10], p[11], 0.0f}, 3);
-        if (!weights_.directional) return x;
-        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
-        return put(x, {cosine, fresnel, std::exp(-sigma_t / maximum(cos_t, 0.05f)), 0.0f}, 3);
-    }
-
-    // The first `count` of four numbers, from 0 .. 1 to -1 .. 1; there is room for all four.
-    static float* put(float* x, const Lanes<float>& units, int count) {
-        const Lanes<float> spread = units + units - Lanes<float>(1.0f);
-        std::memcpy(x, &spread, sizeof(spread));
-        return x + count;
-    }
-
-    // How the four scalar parameters of `layered3` become units.
-    struct Scale {
-        Lanes<float> log{0.0f}, start{0.0f}, per_range{0.0f};
-    };
-
-    static Scale scale_of(const std::vector<SourceParam>& all) {
-        Scale made;
-        int k = 0;
-        for (const SourceParam* p : {&all[0], &all[1], &all[2], &all[6]}) {
-            made.log.set(k, p->logarithmic);
-            made.start.set(k, p->start);
-            made.per_range.set(k++, p->per_range);
-        }
-        return made;
-    }
-
-    // The material of the network's outputs, which become its numbers. Twin of nma/target/decode.py.
-    Material decoded(float* raw, float cosine) const {
-        network_.kernels_in_use().decode(ranges_, raw, 1.0f - cosine * cosine);
-        return material(raw, cosine);
-    }
-
-    // From the numbers of all instances and the shares of the blend; there is room for a number after them.
-    Material material(float* numbers, float cosine) const {
-        Material made;
-        Blend<float>& blend = made.blend_;
-        blend.count = weights_.instances;
-        blend.scale = {1.0f, 1.0f, 1.0f};
-        numbers[network_.output_stride()] = 0.0f;
-        const int* index = lane_index_.data();
-        const float* share = numbers + output_count_ - (blend.count - 1);
-        float left = 1.0f;
-        for (int n = 0; n < blend.used(); ++n) {
-            Pack<float>& pack = blend.packs[n];
-            Lanes<float>* lanes = pack.lanes();
-            for (int f = 0; f < Blend<float>::FIELDS; ++f, index += LANES) lanes[f] = {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
-            float weights[LANES] = {};
-            for (int k = n * LANES; k < std::min(blend.count, (n + 1) * LANES); ++k) {
-                const float part = k + 1 < blend.count ? *share++ : 1.0f;
-                weights[k % LANES] = left * part;
-                left -= left * part;
-            }
-            pack.weights = {weights[0], weights[1], weights[2], weights[3]};
-        }
-        weigh(blend, cosine, weights_.bounded);
-        made.in_plane_ = in_plane_;
-        return made;
     }
 
     Weights weights_;
     Network network_;
-    std::vector<int> fields_, lane_index_;
-    std::unique_ptr<float[], detail::FreeAligned> ranges_memory_;
-    Ranges ranges_{};
-    Encoding encoding_ = Encoding::Raw;
-    Scale scale_;
-    int parameter_count_ = 0, output_count_ = 0;
+    Recipe recipe_{};
+    std::vector<int> fields_, lanes_;
+    std::unique_ptr<float[], detail::FreeAligned> ranges_;
     bool in_plane_ = false;
 };
 

@@ -1,4 +1,4 @@
-// The network and its decoding for each instruction set, chosen at run time: one binary serves all CPUs.
+// `Adapter::prepare` for each instruction set, chosen at run time: one binary serves all CPUs.
 //
 // Every instruction set compiles the same code, kernels/body.inl, over its own vector type; avx512_bf16 has a product of
 // its own, which rounds weights and activations to bfloat16.
@@ -88,23 +88,27 @@ struct Kernels {
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
     // Many: rows of `inputs` padded likewise, rows of the last layer's width in `outputs`.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs, int output_stride);
-    // Raw outputs to numbers of the target, in place, 64-byte aligned.
-    void (*decode)(const Ranges&, float* raw, float fade);
+    // What comes before the network, with room for LANES numbers after `inputs`; and after it, with room for one after
+    // `raw`, which is aligned to 64 bytes.
+    void (*encode)(const Recipe&, const float* parameters, float cosine, float* inputs);
+    void (*finish)(const Recipe&, float* raw, float cosine, Blend<float>&);
+    // All three for one query.
+    void (*prepare)(const Recipe&, const float* parameters, float cosine, Blend<float>&);
 };
 
 // Those of `set`; the portable ones if it cannot run here.
 inline const Kernels& kernels(InstructionSet set) {
-    static constexpr Kernels PORTABLE{InstructionSet::portable, portable::forward, portable::forward_many, portable::decode};
+    static constexpr Kernels PORTABLE{InstructionSet::portable, portable::forward, portable::forward_many, portable::encode, portable::finish, portable::prepare<portable::forward>};
     if (!supported(set)) return PORTABLE;
 #if defined(NMA_X86)
-    static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::decode};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward, avx512::forward_many, avx512::decode};
-    static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::decode};
+    static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::encode, avx2::finish, avx2::prepare<avx2::forward>};
+    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward, avx512::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512::forward>};
+    static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512_bf16::forward>};
     if (set == InstructionSet::avx2) return AVX2;
     if (set == InstructionSet::avx512) return AVX512;
     if (set == InstructionSet::avx512_bf16) return BF16;
 #elif defined(NMA_ARM)
-    static constexpr Kernels NEON{InstructionSet::neon, neon::forward, neon::forward_many, neon::decode};
+    static constexpr Kernels NEON{InstructionSet::neon, neon::forward, neon::forward_many, neon::encode, neon::finish, neon::prepare<neon::forward>};
     if (set == InstructionSet::neon) return NEON;
 #endif
     return PORTABLE;

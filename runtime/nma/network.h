@@ -60,6 +60,7 @@ public:
 
     InstructionSet instruction_set() const { return kernels_->set; }
     const Kernels& kernels_in_use() const { return *kernels_; }
+    const NetworkView& view() const { return view_; }
 
     // Rows of inputs and outputs have room for these many numbers; inputs beyond the network's own are 0.
     int input_stride() const { return view_.layers[0].in; }

@@ -3,7 +3,7 @@
 
 #include <immintrin.h>
 
-#include "layout.h"
+#include "../recipe.h"
 #include "macros.h"
 
 #define NMA_FN NMA_TARGET("avx2,fma")

@@ -3,7 +3,7 @@
 
 #include <immintrin.h>
 
-#include "layout.h"
+#include "../recipe.h"
 #include "macros.h"
 
 #define NMA_FN NMA_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma")

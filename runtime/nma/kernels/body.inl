@@ -92,7 +92,8 @@ NMA_OP Vec exponential(Vec x) {
     return mul(sum, power(n));
 }
 
-NMA_FN inline void decode(const Ranges& ranges, float* raw, float fade) {
+// Raw outputs to numbers of the target, in place. Twin of nma/target/decode.py.
+NMA_OP void decode(const Ranges& ranges, float* raw, float fade) {
     const Vec one = set(1.0f);
     for (int k = 0; k < ranges.count; k += LANES) {
         const Vec x = max(min(load(raw + k), set(80.0f)), set(-80.0f));
@@ -106,4 +107,22 @@ NMA_FN inline void decode(const Ranges& ranges, float* raw, float fade) {
         }
         store(raw + k, mul(value, fma(load(ranges.in_plane + k), set(fade - 1.0f), one)));
     }
+}
+
+NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameters, float cosine, float* inputs) {
+    recipe.encoding.encode(parameters, cosine, inputs, recipe.network.layers[0].in);
+}
+
+NMA_FN NMA_WHOLE inline void finish(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
+    decode(recipe.ranges, raw, 1.0f - cosine * cosine);
+    assemble(recipe, raw, blend);
+    weigh(blend, cosine, recipe.bounded);
+}
+
+template <void (*FORWARD)(const NetworkView&, const float*, float*)>
+NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
+    alignas(64) float inputs[WIDEST_LAYER + nma::LANES], numbers[WIDEST_LAYER + 1];
+    encode(recipe, parameters, cosine, inputs);
+    FORWARD(recipe.network, inputs, numbers);
+    finish(recipe, numbers, cosine, blend);
 }

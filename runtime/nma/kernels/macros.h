@@ -12,7 +12,10 @@
 #if defined(__GNUC__)
 #define NMA_TARGET(features) __attribute__((target(features)))
 #define NMA_INLINE inline __attribute__((always_inline))
+// What such a function calls becomes part of it, and so is compiled for its instruction set.
+#define NMA_WHOLE __attribute__((flatten))
 #else
 #define NMA_TARGET(features)
 #define NMA_INLINE __forceinline
+#define NMA_WHOLE
 #endif

@@ -3,7 +3,7 @@
 
 #include <arm_neon.h>
 
-#include "layout.h"
+#include "../recipe.h"
 #include "macros.h"
 
 #define NMA_FN

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <cstring>
 
-#include "layout.h"
+#include "../recipe.h"
 #include "macros.h"
 
 #define NMA_FN

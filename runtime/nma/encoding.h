@@ -1,0 +1,88 @@
+// What the network reads: a material's parameters and cos(theta_i), turned into about unit-sized numbers. Twin of
+// nma/encoding.py.
+#pragma once
+
+#include "lanes.h"
+#include "target.h"
+#include "weights.h"
+
+namespace nma {
+
+class Encoding {
+public:
+    Encoding() = default;
+
+    explicit Encoding(const Weights& weights) : kind_(kind_named(weights.encoding)), directional_(weights.directional) {
+        for (const SourceParam& p : weights.parameters) parameters_ += p.size;
+        if (kind_ != Kind::Layered3) return;
+        if (parameters_ != 13 || weights.parameters.size() != 7) throw Error("the encoding 'layered3' belongs to another class");
+        int k = 0;
+        for (const SourceParam* p : {&weights.parameters[0], &weights.parameters[1], &weights.parameters[2], &weights.parameters[6]}) {
+            log_.set(k, p->logarithmic);
+            start_.set(k, p->start);
+            per_range_.set(k++, p->per_range);
+        }
+    }
+
+    // Numbers that it takes, and that it makes of them.
+    int parameters() const { return parameters_; }
+    int size() const { return kind_ == Kind::Direction ? 1 : kind_ == Kind::Raw ? parameters_ + directional_ : 13 + 3 * directional_; }
+
+    // Writes `size` numbers and then zeros up to `stride`; there is room for LANES more.
+    void encode(const float* p, float cosine, float* x, int stride) const {
+        float* const end = x + stride;
+        if (kind_ == Kind::Direction) {
+            *x++ = directional_ ? 2.0f * cosine - 1.0f : 1.0f;
+        } else if (kind_ == Kind::Raw) {
+            x = std::copy_n(p, parameters_, x);
+            if (directional_) *x++ = cosine;
+        } else {
+            x = layered3(p, cosine, x);
+        }
+        std::fill(x, end, 0.0f);
+    }
+
+private:
+    enum class Kind { Raw, Direction, Layered3 };
+
+    static Kind kind_named(const std::string& name) {
+        if (name == "raw") return Kind::Raw;
+        if (name == "direction") return Kind::Direction;
+        if (name == "layered3") return Kind::Layered3;
+        throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
+    }
+
+    float* layered3(const float* p, float cosine, float* x) const {
+        using Four = Lanes<float>;
+        constexpr float GRAZING = 0.1045f;
+        const float sigma_t = p[12];
+        const Four one(1.0f), inside(1.0f / p[2]);
+        const Four plain{p[0], p[1], p[2], sigma_t};
+        const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
+        // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
+        const Four n = Four(p[3], p[4], p[5], 1.0f) * inside, k = Four(p[6], p[7], p[8], 0.0f) * inside, k2 = k * k;
+        const Four less = n - one, more = n + one;
+        x = put(x, (bent - start_) * per_range_, 4);
+        x = put(x, (less * less + k2) / (more * more + k2), 3);
+        x = put(x, fresnel_conductor<Four>(Four(GRAZING), n, k), 3);
+        x = put(x, {p[9], p[10], p[11], 0.0f}, 3);
+        if (!directional_) return x;
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
+        return put(x, {cosine, fresnel, std::exp(-sigma_t / maximum(cos_t, 0.05f)), 0.0f}, 3);
+    }
+
+    // The first `count` of four numbers, from 0 .. 1 to -1 .. 1; there is room for all four.
+    static float* put(float* x, const Lanes<float>& units, int count) {
+        const Lanes<float> spread = units + units - Lanes<float>(1.0f);
+        std::memcpy(x, &spread, sizeof(spread));
+        return x + count;
+    }
+
+    Kind kind_ = Kind::Raw;
+    bool directional_ = false;
+    int parameters_ = 0;
+    // How the four scalar parameters of `layered3` become units.
+    Lanes<float> log_{0.0f}, start_{0.0f}, per_range_{0.0f};
+};
+
+}  // namespace nma
