@@ -106,12 +106,11 @@ public:
 
     // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
     void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
-        alignas(64) float outputs[BLOCK * WIDEST_LAYER + 1];
+        alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
             outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count(), cos_theta_i + first, outputs);
-            // The last one first: a material's numbers end where those of the next query begin.
-            for (int q = now - 1; q >= 0; --q) {
+            for (int q = 0; q < now; ++q) {
                 Material& made = materials[first + q];
                 made.in_plane_ = in_plane_;
                 kernels().finish(recipe_, outputs + q * network_.output_stride(), cos_theta_i[first + q], made.blend_);
@@ -184,25 +183,24 @@ private:
     // The ranges of all outputs, of instance after instance; shares of the blend lie in 0 .. 1.
     void lay_out_ranges() {
         const int count = network_.output_stride();
-        ranges_ = detail::aligned<float>(4 * static_cast<std::size_t>(count));
-        float *low = ranges_.get(), *span = low + count, *log = span + count, *in_plane = log + count;
-        recipe_.ranges = {count, false, low, span, log, in_plane};
+        ranges_ = detail::aligned<float>(5 * static_cast<std::size_t>(count));
+        float *start = ranges_.get(), *slope = start + count, *factor = slope + count, *rate = factor + count, *in_plane = rate + count;
+        recipe_.ranges = {count, 0, start, slope, factor, rate, in_plane};
         int next = 0;
         for (int k = 0; k < weights_.instances; ++k)
             for (const TargetParam& p : weights_.target)
                 for (int c = 0; c < p.size; ++c, ++next) {
-                    low[next] = static_cast<float>(p.low);
-                    span[next] = static_cast<float>(p.logarithmic ? std::log(p.high / p.low) : p.high - p.low);
-                    log[next] = p.logarithmic;
                     in_plane[next] = p.in_plane;
-                    recipe_.ranges.any_log |= p.logarithmic;
+                    (p.logarithmic ? factor : start)[next] = static_cast<float>(p.low);
+                    (p.logarithmic ? rate : slope)[next] = static_cast<float>(p.logarithmic ? std::log(p.high / p.low) : p.high - p.low);
+                    if (p.logarithmic) recipe_.ranges.logarithmic = next + 1;
                 }
-        std::fill(span + next, span + count, 1.0f);
+        std::fill(slope + next, slope + output_count(), 1.0f);
     }
 
     void lay_out_lanes() {
         const int size = static_cast<int>(fields_.size()), per_pack = Blend<float>::FIELDS * LANES;
-        lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, network_.output_stride());
+        lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, output_count());
         for (int k = 0; k < weights_.instances; ++k)
             for (int f = 0; f < size; ++f) lanes_[k / LANES * per_pack + fields_[f] * LANES + k % LANES] = k * size + f;
         recipe_.lanes = lanes_.data();

@@ -88,8 +88,7 @@ struct Kernels {
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
     // Many: rows of `inputs` padded likewise, rows of the last layer's width in `outputs`.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs, int output_stride);
-    // What comes before the network, with room for LANES numbers after `inputs`; and after it, with room for one after
-    // `raw`, which is aligned to 64 bytes.
+    // What comes before the network, with room for LANES numbers after `inputs`; and after it, `raw` aligned to 64 bytes.
     void (*encode)(const Recipe&, const float* parameters, float cosine, float* inputs);
     void (*finish)(const Recipe&, float* raw, float cosine, Blend<float>&);
     // All three for one query.

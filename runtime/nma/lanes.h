@@ -39,6 +39,10 @@ template <class T> inline Four<T> operator/(const Four<T>& a, const Four<T>& b) 
 template <class T> inline Four<T> least(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return minimum(a[k], b[k]); }); }
 template <class T> inline Four<T> most(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return maximum(a[k], b[k]); }); }
 template <class T> inline Four<T> roots(const Four<T>& a) { return each<T>([&](int k) { return std::sqrt(a[k]); }); }
+template <class T> inline Four<T> sums(const Four<T>& a, const Four<T>& b, const Four<T>& c, const Four<T>& d) {
+    const auto sum = [](const Four<T>& v) { return (v[0] + v[2]) + (v[1] + v[3]); };
+    return {{sum(a), sum(b), sum(c), sum(d)}};
+}
 template <class T> inline Four<T> logarithms(const Four<T>& a) { return each<T>([&](int k) { return std::log(a[k]); }); }
 
 template <class T>
@@ -55,17 +59,31 @@ struct Storage<float> {
     using Type = Floats;
 };
 
+#if defined(__SSE2__)
+inline Floats least(Floats a, Floats b) { return (Floats)_mm_min_ps((__m128)b, (__m128)a); }
+inline Floats most(Floats a, Floats b) { return (Floats)_mm_max_ps((__m128)b, (__m128)a); }
+inline Floats roots(Floats a) { return (Floats)_mm_sqrt_ps((__m128)a); }
+inline Floats sums(Floats a, Floats b, Floats c, Floats d) {
+    const __m128 ab = _mm_add_ps(_mm_unpacklo_ps((__m128)a, (__m128)b), _mm_unpackhi_ps((__m128)a, (__m128)b));
+    const __m128 cd = _mm_add_ps(_mm_unpacklo_ps((__m128)c, (__m128)d), _mm_unpackhi_ps((__m128)c, (__m128)d));
+    return (Floats)_mm_add_ps(_mm_movelh_ps(ab, cd), _mm_movehl_ps(cd, ab));
+}
+#elif defined(__aarch64__)
 inline Floats least(Floats a, Floats b) { return b < a ? b : a; }
 inline Floats most(Floats a, Floats b) { return a < b ? b : a; }
-inline Floats roots(Floats a) {
-#if defined(__SSE2__)
-    return (Floats)_mm_sqrt_ps((__m128)a);
-#elif defined(__aarch64__)
-    return (Floats)vsqrtq_f32((float32x4_t)a);
-#else
-    return Floats{std::sqrt(a[0]), std::sqrt(a[1]), std::sqrt(a[2]), std::sqrt(a[3])};
-#endif
+inline Floats roots(Floats a) { return (Floats)vsqrtq_f32((float32x4_t)a); }
+inline Floats sums(Floats a, Floats b, Floats c, Floats d) {
+    return (Floats)vpaddq_f32(vpaddq_f32((float32x4_t)a, (float32x4_t)b), vpaddq_f32((float32x4_t)c, (float32x4_t)d));
 }
+#else
+inline Floats least(Floats a, Floats b) { return b < a ? b : a; }
+inline Floats most(Floats a, Floats b) { return a < b ? b : a; }
+inline Floats roots(Floats a) { return Floats{std::sqrt(a[0]), std::sqrt(a[1]), std::sqrt(a[2]), std::sqrt(a[3])}; }
+inline Floats sums(Floats a, Floats b, Floats c, Floats d) {
+    const auto sum = [](Floats v) { return (v[0] + v[2]) + (v[1] + v[3]); };
+    return Floats{sum(a), sum(b), sum(c), sum(d)};
+}
+#endif
 
 // To two units in the last place for normal numbers; 0 becomes a number below -88. The mantissa is brought to
 // sqrt(1/2) .. sqrt(2), and log(m) is 2 artanh(s), s = (m - 1) / (m + 1), as a series.
@@ -110,6 +128,8 @@ template <class T> inline Lanes<T> log(const Lanes<T>& a) { return detail::logar
 template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(maximum(a, Lanes<T>(T(0)))); }
 
 template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
+// The sums of four, side by side.
+template <class T> inline Lanes<T> sums(const Lanes<T>& a, const Lanes<T>& b, const Lanes<T>& c, const Lanes<T>& d) { return detail::sums(a.v, b.v, c.v, d.v); }
 template <class T> inline Vec3<T> sum(const Vec3<Lanes<T>>& a) { return {sum(a.x), sum(a.y), sum(a.z)}; }
 
 }  // namespace nma

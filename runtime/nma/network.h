@@ -48,9 +48,10 @@ public:
         const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
         int in = detail::padded(layers.front().in, INPUT_STEP);
         for (std::size_t k = 0; k < layers.size(); ++k) {
-            if (layers[k].in > WIDEST_LAYER || layers[k].out > WIDEST_LAYER) throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
+            const int out = layers[k].out + (k + 1 == layers.size());
+            if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER) throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
             LayerView& view = view_.layers[k];
-            view = {in, detail::padded(layers[k].out, WIDTH_STEP), nullptr, nullptr, nullptr};
+            view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr};
             view.bias = keep(layers[k].bias, view.width);
             if (pairs) view.pairs = keep_pairs(layers[k], view);
             else view.columns = keep_columns(layers[k], view);
@@ -62,7 +63,8 @@ public:
     const Kernels& kernels_in_use() const { return *kernels_; }
     const NetworkView& view() const { return view_; }
 
-    // Rows of inputs and outputs have room for these many numbers; inputs beyond the network's own are 0.
+    // Rows of inputs and outputs have room for these many numbers. Inputs beyond the network's own are 0, and so are outputs,
+    // of which there is at least one.
     int input_stride() const { return view_.layers[0].in; }
     int output_stride() const { return view_.layers[view_.depth - 1].width; }
 

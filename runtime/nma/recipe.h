@@ -4,6 +4,7 @@
 #include "blend.h"
 #include "encoding.h"
 #include "kernels/layout.h"
+#include "kernels/macros.h"
 
 namespace nma {
 
@@ -13,28 +14,34 @@ struct Recipe {
     Ranges ranges;
     int instances, outputs;
     bool bounded;
-    // The number that each lane of each field takes, of one pack after the other. Lanes without one take the number after
-    // all others, which is 0.
+    // The number that each lane of each field takes, of one pack after the other; lanes without one take one that is 0.
     const int* lanes;
 };
 
-// The instances and weights of a blend from their numbers, after which there is room for another.
-inline void assemble(const Recipe& recipe, float* numbers, Blend<float>& blend) {
+// Numbers for lanes by their index.
+struct Indexed {
+    const float* numbers;
+
+    Lanes<float> operator()(const int* index) const { return {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]}; }
+};
+
+// The instances and weights of a blend from their numbers, which `pick` brings to lanes.
+template <class Pick>
+inline void assemble(const Recipe& recipe, const float* numbers, const Pick& pick, Blend<float>& blend) {
     blend.count = recipe.instances;
     blend.scale = {1.0f, 1.0f, 1.0f};
-    numbers[recipe.ranges.count] = 0.0f;
     const int* index = recipe.lanes;
     const float* share = numbers + recipe.outputs - (blend.count - 1);
     float left = 1.0f;
     for (int n = 0; n < blend.used(); ++n) {
         Pack<float>& pack = blend.packs[n];
-        Lanes<float>* lanes = pack.lanes();
-        for (int f = 0; f < Blend<float>::FIELDS; ++f, index += LANES) lanes[f] = {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
+        NMA_UNROLL for (int f = 0; f < Blend<float>::FIELDS; ++f, index += LANES) pack.lanes()[f] = pick(index);
         float weights[LANES] = {};
-        for (int k = n * LANES; k < std::min(blend.count, (n + 1) * LANES); ++k) {
-            const float part = k + 1 < blend.count ? *share++ : 1.0f;
-            weights[k % LANES] = left * part;
-            left -= left * part;
+        NMA_UNROLL for (int k = 0; k < LANES; ++k) {
+            const int next = n * LANES + k + 1;
+            if (next > blend.count) break;
+            weights[k] = next < blend.count ? left * *share++ : left;
+            left -= weights[k];
         }
         pack.weights = {weights[0], weights[1], weights[2], weights[3]};
     }

@@ -1,9 +1,9 @@
 // The kernels, compiled once for each instruction set inside its namespace. No include guard: that is the point.
 //
 // Before it stand NMA_FN (attributes of a function for this instruction set), NMA_OP (the same, always inlined), NMA_UNROLL,
-// Vec (LANES floats) with load, store, set, add, mul, fma (a b + c), div, max, min, nearest (round to whole), power (2^whole),
-// even and odd (floats from the low and high halves of a pair), and the sizes of tiles: SINGLE_TILE vectors of neurons
-// for one query, BATCH_TILE vectors for each of BATCH_QUERIES.
+// Vec (LANES floats) with load, store, set, add, mul, fma (a b + c), inverse (1 / a), max, min, nearest (round to whole),
+// scale (a 2^whole), even and odd (floats from the low and high halves of a pair), and the sizes of tiles: SINGLE_TILE
+// vectors of neurons for one query, BATCH_TILE vectors for each of BATCH_QUERIES.
 
 // `VECTORS` vectors of neurons from `first` on, for QUERIES queries. A neuron's sum is kept as SUMS sums: in a single one
 // each multiplication would wait for the one before it.
@@ -87,9 +87,10 @@ NMA_OP Vec exponential(Vec x) {
     const Vec n = nearest(mul(x, set(1.44269504f)));
     // log(2) in two parts, of which the first one times n is exact.
     const Vec r = fma(n, set(-1.42860677e-6f), fma(n, set(-0.693145752f), x));
-    Vec sum = set(1.0f / 5040.0f);
-    for (const float c : {1.0f / 720.0f, 1.0f / 120.0f, 1.0f / 24.0f, 1.0f / 6.0f, 0.5f, 1.0f, 1.0f}) sum = fma(sum, r, set(c));
-    return mul(sum, power(n));
+    const Vec r2 = mul(r, r), one = set(1.0f);
+    const Vec low = fma(fma(r, set(1.0f / 6.0f), set(0.5f)), r2, add(one, r));
+    const Vec high = fma(fma(r, set(1.0f / 5040.0f), set(1.0f / 720.0f)), r2, fma(r, set(1.0f / 120.0f), set(1.0f / 24.0f)));
+    return scale(fma(high, mul(r2, r2), low), n);
 }
 
 // Raw outputs to numbers of the target, in place. Twin of nma/target/decode.py.
@@ -97,14 +98,9 @@ NMA_OP void decode(const Ranges& ranges, float* raw, float fade) {
     const Vec one = set(1.0f);
     for (int k = 0; k < ranges.count; k += LANES) {
         const Vec x = max(min(load(raw + k), set(80.0f)), set(-80.0f));
-        const Vec unit = div(one, add(one, exponential(mul(x, set(-1.0f)))));
-        const Vec low = load(ranges.low + k), step = mul(load(ranges.span + k), unit);
-        Vec value = add(low, step);
-        if (ranges.any_log) {
-            const Vec is_log = load(ranges.log + k);
-            const Vec power_law = mul(low, exponential(mul(is_log, step)));
-            value = fma(is_log, add(power_law, mul(value, set(-1.0f))), value);
-        }
+        const Vec unit = inverse(add(one, exponential(mul(x, set(-1.0f)))));
+        Vec value = fma(load(ranges.slope + k), unit, load(ranges.start + k));
+        if (k < ranges.logarithmic) value = fma(load(ranges.factor + k), exponential(mul(load(ranges.rate + k), unit)), value);
         store(raw + k, mul(value, fma(load(ranges.in_plane + k), set(fade - 1.0f), one)));
     }
 }
@@ -115,13 +111,13 @@ NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameter
 
 NMA_FN NMA_WHOLE inline void finish(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
     decode(recipe.ranges, raw, 1.0f - cosine * cosine);
-    assemble(recipe, raw, blend);
+    assemble(recipe, raw, Indexed{raw}, blend);
     weigh(blend, cosine, recipe.bounded);
 }
 
 template <void (*FORWARD)(const NetworkView&, const float*, float*)>
 NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
-    alignas(64) float inputs[WIDEST_LAYER + nma::LANES], numbers[WIDEST_LAYER + 1];
+    alignas(64) float inputs[WIDEST_LAYER + nma::LANES], numbers[WIDEST_LAYER];
     encode(recipe, parameters, cosine, inputs);
     FORWARD(recipe.network, inputs, numbers);
     finish(recipe, numbers, cosine, blend);

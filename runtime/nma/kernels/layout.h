@@ -29,12 +29,12 @@ struct NetworkView {
     LayerView layers[DEEPEST_NETWORK];
 };
 
-// Numbers that a network's outputs become: low + span u or low exp(span u) of their sigmoid u, and those `in_plane`
-// times the fade towards normal incidence. All padded to `count`, a multiple of WIDTH_STEP.
+// Numbers that a network's outputs become, of their sigmoids u: start + slope u + factor exp(rate u), and those `in_plane`
+// times the fade towards normal incidence. All padded with zeros to `count`, a multiple of WIDTH_STEP that leaves room for
+// at least one of them; from `logarithmic` on all factors are 0.
 struct Ranges {
-    int count;
-    bool any_log;
-    const float *low, *span, *log, *in_plane;  // `log` and `in_plane` hold 1 or 0
+    int count, logarithmic;
+    const float *start, *slope, *factor, *rate, *in_plane;  // `in_plane` holds 1 or 0
 };
 
 }  // namespace nma
