@@ -120,7 +120,7 @@ public:
 
     // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
     void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
-        alignas(64) float inputs[WIDEST_LAYER + LANES];
+        alignas(64) float inputs[WIDEST_LAYER];
         kernels().encode(recipe_, parameters, cos_theta_i, inputs);
         network_.forward(inputs, raw);
     }
@@ -139,14 +139,16 @@ public:
 private:
     friend class Curves;
 
-    Adapter(Weights weights, const Options& options) : weights_(std::move(weights)), network_(weights_.layers, options.set, options.compact) {
+    Adapter(Weights weights, const Options& options) : weights_(std::move(weights)) {
         for (const TargetParam& p : weights_.target) add_fields(p);
         recipe_.encoding = Encoding(weights_);
-        recipe_.network = network_.view();
         recipe_.instances = weights_.instances;
         recipe_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
         recipe_.bounded = weights_.bounded;
         check();
+        weights_.layers.front() = recipe_.encoding.arranged(weights_.layers.front());
+        network_ = Network(weights_.layers, options.set, options.compact);
+        recipe_.network = network_.view();
         lay_out_ranges();
         lay_out_lanes();
         weights_.layers.clear();
@@ -207,7 +209,7 @@ private:
     }
 
     void outputs_of_block(int count, const float* parameters, const float* cos_theta_i, float* outputs) const {
-        alignas(64) float inputs[BLOCK * WIDEST_LAYER + LANES];
+        alignas(64) float inputs[BLOCK * WIDEST_LAYER];
         for (int q = 0; q < count; ++q) kernels().encode(recipe_, parameters + q * parameter_count(), cos_theta_i[q], inputs + q * network_.input_stride());
         network_.forward_many(count, inputs, outputs);
     }

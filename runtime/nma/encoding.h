@@ -24,20 +24,28 @@ public:
         }
     }
 
-    // Numbers that it takes, and that it makes of them.
+    // Numbers that it takes, and that the network was trained on.
     int parameters() const { return parameters_; }
     int size() const { return kind_ == Kind::Direction ? 1 : kind_ == Kind::Raw ? parameters_ + directional_ : 13 + 3 * directional_; }
 
-    // Writes `size` numbers and then zeros up to `stride`; there is room for LANES more.
+    // The network's first layer for numbers in the order of `encode`.
+    Layer arranged(const Layer& first) const {
+        if (kind_ != Kind::Layered3) return first;
+        Layer made{4 * LANES, first.out, std::vector<float>(4 * LANES * static_cast<std::size_t>(first.out)), first.bias};
+        for (int j = 0; j < first.out; ++j)
+            for (int i = 0; i < first.in; ++i) made.matrix[j * made.in + place(i)] = first.matrix[j * first.in + i];
+        return made;
+    }
+
+    // `x` is padded with zeros to `stride`.
     void encode(const float* p, float cosine, float* x, int stride) const {
+        if (kind_ == Kind::Layered3) return layered3(p, cosine, x);
         float* const end = x + stride;
         if (kind_ == Kind::Direction) {
             *x++ = directional_ ? 2.0f * cosine - 1.0f : 1.0f;
-        } else if (kind_ == Kind::Raw) {
+        } else {
             x = std::copy_n(p, parameters_, x);
             if (directional_) *x++ = cosine;
-        } else {
-            x = layered3(p, cosine, x);
         }
         std::fill(x, end, 0.0f);
     }
@@ -52,7 +60,10 @@ private:
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
-    float* layered3(const float* p, float cosine, float* x) const {
+    // Four scalars, three colours, and in the fourth lanes of those what depends on the direction.
+    static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
+
+    void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;
         constexpr float GRAZING = 0.1045f;
         const float sigma_t = p[12];
@@ -62,20 +73,20 @@ private:
         // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
         const Four n = Four(p[3], p[4], p[5], 1.0f) * inside, k = Four(p[6], p[7], p[8], 0.0f) * inside, k2 = k * k;
         const Four less = n - one, more = n + one;
-        x = put(x, (bent - start_) * per_range_, 4);
-        x = put(x, (less * less + k2) / (more * more + k2), 3);
-        x = put(x, fresnel_conductor<Four>(Four(GRAZING), n, k), 3);
-        x = put(x, {p[9], p[10], p[11], 0.0f}, 3);
-        if (!directional_) return x;
-        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
-        return put(x, {cosine, fresnel, std::exp(-sigma_t / maximum(cos_t, 0.05f)), 0.0f}, 3);
-    }
-
-    // The first `count` of four numbers, from 0 .. 1 to -1 .. 1; there is room for all four.
-    static float* put(float* x, const Lanes<float>& units, int count) {
-        const Lanes<float> spread = units + units - Lanes<float>(1.0f);
-        std::memcpy(x, &spread, sizeof(spread));
-        return x + count;
+        Four normal = (less * less + k2) / (more * more + k2), grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
+        Four albedo{p[9], p[10], p[11], 0.0f};
+        if (directional_) {
+            const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
+            normal.set(3, cosine);
+            grazing.set(3, fresnel);
+            albedo.set(3, std::exp(-sigma_t / maximum(cos_t, 0.05f)));
+        }
+        const Four units[] = {(bent - start_) * per_range_, normal, grazing, albedo};
+        for (const Four& unit : units) {
+            const Four spread = unit * Four(2.0f) - one;
+            std::memcpy(x, &spread, sizeof(spread));
+            x += LANES;
+        }
     }
 
     Kind kind_ = Kind::Raw;

@@ -88,7 +88,7 @@ struct Kernels {
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
     // Many: rows of `inputs` padded likewise, rows of the last layer's width in `outputs`.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs, int output_stride);
-    // What comes before the network, with room for LANES numbers after `inputs`; and after it, `raw` aligned to 64 bytes.
+    // What comes before the network and after it, `raw` aligned to 64 bytes.
     void (*encode)(const Recipe&, const float* parameters, float cosine, float* inputs);
     void (*finish)(const Recipe&, float* raw, float cosine, Blend<float>&);
     // All three for one query.
@@ -101,7 +101,7 @@ inline const Kernels& kernels(InstructionSet set) {
     if (!supported(set)) return PORTABLE;
 #if defined(NMA_X86)
     static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::encode, avx2::finish, avx2::prepare<avx2::forward>};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward, avx512::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512::forward>};
+    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512::forward_narrow>};
     static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512_bf16::forward>};
     if (set == InstructionSet::avx2) return AVX2;
     if (set == InstructionSet::avx512) return AVX512;

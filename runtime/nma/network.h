@@ -51,12 +51,15 @@ public:
             const int out = layers[k].out + (k + 1 == layers.size());
             if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER) throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
             LayerView& view = view_.layers[k];
-            view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr};
+            view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
             view.bias = keep(layers[k].bias, view.width);
             if (pairs) view.pairs = keep_pairs(layers[k], view);
             else view.columns = keep_columns(layers[k], view);
             in = view.width;
         }
+        view_.narrow = !pairs && std::all_of(view_.layers, view_.layers + view_.depth, [](const LayerView& layer) { return layer.width == NARROW; });
+        if (view_.narrow)
+            for (int k = 0; k < view_.depth; ++k) view_.layers[k].turned = keep_turned(view_.layers[k]);
     }
 
     InstructionSet instruction_set() const { return kernels_->set; }
@@ -91,6 +94,14 @@ private:
         float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
         for (int j = 0; j < layer.out; ++j)
             for (int i = 0; i < layer.in; ++i) to[i * view.width + j] = layer.matrix[j * layer.in + i];
+        return to;
+    }
+
+    const float* keep_turned(const LayerView& view) {
+        float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
+        for (int i = 0; i < view.in; ++i)
+            for (int j = 0; j < view.width; ++j)
+                to[(j / WIDTH_STEP * view.in + i) * WIDTH_STEP + j % WIDTH_STEP] = view.columns[(i / 4 * 4 + j % 4) * view.width + j / 4 * 4 + (j + i) % 4];
         return to;
     }
 

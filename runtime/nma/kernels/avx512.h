@@ -39,6 +39,48 @@ NMA_OP Vec odd(const std::uint32_t* pairs) { return _mm512_castsi512_ps(_mm512_a
 
 #include "body.inl"
 
+// A column's four numbers from `p` on, or from block B of a vector on, in all blocks of four lanes.
+NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_load_ps(p)); }
+template <int B>
+NMA_OP Vec repeat(Vec v) { return _mm512_maskz_shuffle_f32x4(ALL, v, v, B * 0x55); }
+// Lane k of each block of four becomes lane (k + R) % 4.
+template <int R>
+NMA_OP Vec turn(Vec v) { return _mm512_maskz_permute_ps(ALL, v, R == 1 ? 0x93 : 0x4e); }
+
+// Adds what four inputs, in all blocks, contribute by four columns to the sums that are still to be turned.
+NMA_OP void add_block(Vec (&sums)[4], Vec inputs, const float* columns) {
+    NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * LANES), sums[r]);
+}
+NMA_OP Vec turned(const Vec (&sums)[4]) { return add(add(sums[0], turn<1>(sums[1])), turn<2>(add(sums[2], turn<1>(sums[3])))); }
+
+// A layer of two vectors for inputs in memory, and for the two vectors of the layer before it.
+NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
+    NMA_UNROLL for (int v = 0; v < 2; ++v) {
+        const float* column = layer.turned + v * layer.in * LANES;
+        Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
+        for (int i = 0; i < layer.in; i += 4) add_block(sums, repeat(x + i), column + i * LANES);
+        y[v] = turned(sums);
+    }
+}
+NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
+    const Vec a = max(y[0], set(0.0f)), b = max(y[1], set(0.0f));
+    const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a), repeat<0>(b), repeat<1>(b), repeat<2>(b), repeat<3>(b)};
+    NMA_UNROLL for (int v = 0; v < 2; ++v) {
+        Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
+        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.turned + (v * 8 + k) * 4 * LANES);
+        y[v] = turned(sums);
+    }
+}
+
+NMA_FN inline void forward_narrow(const NetworkView& view, const float* inputs, float* outputs) {
+    if (!view.narrow) return forward(view, inputs, outputs);
+    Vec y[2];
+    first_layer(view.layers[0], inputs, y);
+    for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
+    store(outputs, y[0]);
+    store(outputs + LANES, y[1]);
+}
+
 }  // namespace nma::avx512
 
 #undef NMA_FN

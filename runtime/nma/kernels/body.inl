@@ -117,7 +117,7 @@ NMA_FN NMA_WHOLE inline void finish(const Recipe& recipe, float* raw, float cosi
 
 template <void (*FORWARD)(const NetworkView&, const float*, float*)>
 NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
-    alignas(64) float inputs[WIDEST_LAYER + nma::LANES], numbers[WIDEST_LAYER];
+    alignas(64) float inputs[WIDEST_LAYER], numbers[WIDEST_LAYER];
     encode(recipe, parameters, cosine, inputs);
     FORWARD(recipe.network, inputs, numbers);
     finish(recipe, numbers, cosine, blend);

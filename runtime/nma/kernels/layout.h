@@ -11,21 +11,28 @@ constexpr int WIDEST_LAYER = 512;
 constexpr int DEEPEST_NETWORK = 16;
 // Widths are multiples of the widest vector, numbers of inputs multiples of the inputs that a step takes.
 constexpr int WIDTH_STEP = 16, INPUT_STEP = 4;
+// Width of networks whose activations stay in registers where there are enough.
+constexpr int NARROW = 32;
 // Room for the outputs of queries that `forward_many` works on together.
 constexpr int MOST_TOGETHER = 8;
 
 // A layer. Column i of the matrix holds what input i adds to each neuron. Either `columns` is set, floats; or `pairs`,
 // where each number holds the weights of inputs 2 i (low half) and 2 i + 1 (high half) as bfloat16: half the memory,
 // which is what a single query waits for.
+//
+// Networks of little more than two vectors have `turned` too, which takes four inputs at once as they lie, again and again:
+// column 4 b + r holds, at neuron 4 g + k, what input 4 b + k adds to neuron 4 g + (k + r) % 4. The sum over all b is turned
+// by r once, at its end. All columns of the first WIDTH_STEP neurons come first, then those of the next.
 struct LayerView {
     int in, width;  // padded with zeros
     const float* bias;
-    const float* columns;
+    const float *columns, *turned;
     const std::uint32_t* pairs;
 };
 
 struct NetworkView {
     int depth;
+    bool narrow;  // all layers are NARROW wide, and have `turned`
     LayerView layers[DEEPEST_NETWORK];
 };
 
