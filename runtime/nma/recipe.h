@@ -20,8 +20,10 @@ struct Recipe {
 
 // Numbers for lanes by their index.
 struct Indexed {
+    static constexpr int MOST = 0;
     const float* numbers;
 
+    explicit Indexed(const float* all) : numbers(all) {}
     Lanes<float> operator()(const int* index) const { return {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]}; }
 };
 

@@ -30,6 +30,8 @@ NMA_OP __m256i raw(const std::uint32_t* pairs) { return _mm256_load_si256(reinte
 NMA_OP Vec even(const std::uint32_t* pairs) { return _mm256_castsi256_ps(_mm256_slli_epi32(raw(pairs), 16)); }
 NMA_OP Vec odd(const std::uint32_t* pairs) { return _mm256_castsi256_ps(_mm256_and_si256(raw(pairs), _mm256_set1_epi32(-65536))); }
 
+using Few = Indexed;
+
 #include "body.inl"
 
 }  // namespace nma::avx2

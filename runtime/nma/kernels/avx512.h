@@ -37,6 +37,18 @@ NMA_OP __m512i raw(const std::uint32_t* pairs) { return _mm512_load_si512(pairs)
 NMA_OP Vec even(const std::uint32_t* pairs) { return _mm512_castsi512_ps(_mm512_maskz_slli_epi32(ALL, raw(pairs), 16)); }
 NMA_OP Vec odd(const std::uint32_t* pairs) { return _mm512_castsi512_ps(_mm512_and_si512(raw(pairs), _mm512_set1_epi32(-65536))); }
 
+// At most 32 numbers, out of registers.
+struct Few {
+    static constexpr int MOST = 2 * LANES;
+    Vec low, high;
+
+    NMA_FN explicit Few(const float* all) : low(load(all)), high(load(all + LANES)) {}
+    NMA_FN nma::Lanes<float> operator()(const int* index) const {
+        const __m512i four = _mm512_castsi128_si512(_mm_loadu_si128(reinterpret_cast<const __m128i*>(index)));
+        return (detail::Floats)_mm512_maskz_extractf32x4_ps(0xf, _mm512_permutex2var_ps(low, four, high), 0);
+    }
+};
+
 #include "body.inl"
 
 // A column's four numbers from `p` on, or from block B of a vector on, in all blocks of four lanes.

@@ -111,7 +111,8 @@ NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameter
 
 NMA_FN NMA_WHOLE inline void finish(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
     decode(recipe.ranges, raw, 1.0f - cosine * cosine);
-    assemble(recipe, raw, Indexed{raw}, blend);
+    if (recipe.ranges.count <= Few::MOST) assemble(recipe, raw, Few(raw), blend);
+    else assemble(recipe, raw, Indexed(raw), blend);
     weigh(blend, cosine, recipe.bounded);
 }
 

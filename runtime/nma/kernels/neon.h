@@ -29,6 +29,8 @@ NMA_OP Vec scale(Vec a, Vec whole) { return mul(a, vreinterpretq_f32_s32(vshlq_n
 NMA_OP Vec even(const std::uint32_t* pairs) { return vreinterpretq_f32_u32(vshlq_n_u32(vld1q_u32(pairs), 16)); }
 NMA_OP Vec odd(const std::uint32_t* pairs) { return vreinterpretq_f32_u32(vandq_u32(vld1q_u32(pairs), vdupq_n_u32(0xffff0000u))); }
 
+using Few = Indexed;
+
 #include "body.inl"
 
 }  // namespace nma::neon

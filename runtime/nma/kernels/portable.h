@@ -61,6 +61,8 @@ NMA_OP Vec scale(Vec a, Vec whole) { return mul(a, each([&](int k) { return from
 NMA_OP Vec even(const std::uint32_t* pairs) { return each([&](int k) { return from_bits(pairs[k] << 16); }); }
 NMA_OP Vec odd(const std::uint32_t* pairs) { return each([&](int k) { return from_bits(pairs[k] & 0xffff0000u); }); }
 
+using Few = Indexed;
+
 #include "body.inl"
 
 }  // namespace nma::portable
