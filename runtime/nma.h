@@ -194,7 +194,7 @@ private:
                 for (int c = 0; c < p.size; ++c, ++next) {
                     in_plane[next] = p.in_plane;
                     (p.logarithmic ? factor : start)[next] = static_cast<float>(p.low);
-                    (p.logarithmic ? rate : slope)[next] = static_cast<float>(p.logarithmic ? std::log(p.high / p.low) : p.high - p.low);
+                    (p.logarithmic ? rate : slope)[next] = static_cast<float>(p.logarithmic ? std::log2(p.high / p.low) : p.high - p.low);
                     if (p.logarithmic) recipe_.ranges.logarithmic = next + 1;
                 }
         std::fill(slope + next, slope + output_count(), 1.0f);

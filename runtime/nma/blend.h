@@ -81,17 +81,17 @@ struct Sample {
 template <class T>
 inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
     const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
-    // The albedo of the blend, and the sum of all odds.
+    // The albedo of the blend, and its three colours together: three times the sum of all odds.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
         const Albedos<Lanes<T>> a = lobe_albedos<Lanes<T>>(pack.instances, cosine);
         const Lanes<T> w = pack.weights;
         pack.odds = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
-        const Vec3<Lanes<T>> albedo = (a.diffuse + a.spec + a.clearcoat) * w;
-        sum += sums(albedo.x, albedo.y, albedo.z, pack.odds.diffuse + pack.odds.spec + pack.odds.clearcoat);
+        const Vec3<Lanes<T>> albedo = (a.diffuse + a.clearcoat + a.spec) * w;
+        sum += sums(albedo.x, albedo.y, albedo.z, albedo.x + albedo.y + albedo.z);
     }
-    const Lanes<T> inverse = Lanes<T>(T(1)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0))), share = inverse[3];
+    const Lanes<T> inverse = Lanes<T>(T(1), T(1), T(1), T(3)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0))), share = inverse[3];
     for (int n = 0; n < blend.used(); ++n) {
         Odds<Lanes<T>>& o = blend.packs[n].odds;
         o = {o.diffuse * share, o.spec * share, o.clearcoat * share};

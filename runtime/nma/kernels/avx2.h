@@ -19,6 +19,7 @@ NMA_OP Vec load(const float* p) { return _mm256_load_ps(p); }
 NMA_OP void store(float* p, Vec v) { _mm256_store_ps(p, v); }
 NMA_OP Vec set(float x) { return _mm256_set1_ps(x); }
 NMA_OP Vec add(Vec a, Vec b) { return _mm256_add_ps(a, b); }
+NMA_OP Vec sub(Vec a, Vec b) { return _mm256_sub_ps(a, b); }
 NMA_OP Vec mul(Vec a, Vec b) { return _mm256_mul_ps(a, b); }
 NMA_OP Vec inverse(Vec a) { return _mm256_div_ps(set(1.0f), a); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return _mm256_fmadd_ps(a, b, c); }

@@ -22,6 +22,7 @@ NMA_OP Vec load(const float* p) { return _mm512_load_ps(p); }
 NMA_OP void store(float* p, Vec v) { _mm512_store_ps(p, v); }
 NMA_OP Vec set(float x) { return _mm512_set1_ps(x); }
 NMA_OP Vec add(Vec a, Vec b) { return _mm512_add_ps(a, b); }
+NMA_OP Vec sub(Vec a, Vec b) { return _mm512_sub_ps(a, b); }
 NMA_OP Vec mul(Vec a, Vec b) { return _mm512_mul_ps(a, b); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a, b, c); }
 // 14 bits, doubled by a step of Newton: a division takes twice as long.

@@ -1,7 +1,7 @@
 // The kernels, compiled once for each instruction set inside its namespace. No include guard: that is the point.
 //
 // Before it stand NMA_FN (attributes of a function for this instruction set), NMA_OP (the same, always inlined), NMA_UNROLL,
-// Vec (LANES floats) with load, store, set, add, mul, fma (a b + c), inverse (1 / a), max, min, nearest (round to whole),
+// Vec (LANES floats) with load, store, set, add, sub, mul, fma (a b + c), inverse (1 / a), max, min, nearest (round to whole),
 // scale (a 2^whole), even and odd (floats from the low and high halves of a pair), and the sizes of tiles: SINGLE_TILE
 // vectors of neurons for one query, BATCH_TILE vectors for each of BATCH_QUERIES.
 
@@ -82,14 +82,11 @@ NMA_FN inline void forward_many(const NetworkView& view, int queries, const floa
     for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
 }
 
-// e^x for |x| <= 87 to two units in the last place: 2^n times the series of the rest, which is at most log(2) / 2.
-NMA_OP Vec exponential(Vec x) {
-    const Vec n = nearest(mul(x, set(1.44269504f)));
-    // log(2) in two parts, of which the first one times n is exact.
-    const Vec r = fma(n, set(-1.42860677e-6f), fma(n, set(-0.693145752f), x));
-    const Vec r2 = mul(r, r), one = set(1.0f);
-    const Vec low = fma(fma(r, set(1.0f / 6.0f), set(0.5f)), r2, add(one, r));
-    const Vec high = fma(fma(r, set(1.0f / 5040.0f), set(1.0f / 720.0f)), r2, fma(r, set(1.0f / 120.0f), set(1.0f / 24.0f)));
+// 2^x for |x| <= 126 to two units in the last place: 2^n times the series of the rest, which is at most 1/2.
+NMA_OP Vec exp2(Vec x) {
+    const Vec n = nearest(x), r = sub(x, n), r2 = mul(r, r);
+    const Vec low = fma(fma(r, set(0.0555041087f), set(0.240226507f)), r2, fma(r, set(0.693147181f), set(1.0f)));
+    const Vec high = fma(fma(r, set(1.52527338e-5f), set(1.54035304e-4f)), r2, fma(r, set(1.33335581e-3f), set(9.61812911e-3f)));
     return scale(fma(high, mul(r2, r2), low), n);
 }
 
@@ -97,11 +94,11 @@ NMA_OP Vec exponential(Vec x) {
 NMA_OP void decode(const Ranges& ranges, float* raw, float fade) {
     const Vec one = set(1.0f);
     for (int k = 0; k < ranges.count; k += LANES) {
-        const Vec x = max(min(load(raw + k), set(80.0f)), set(-80.0f));
-        const Vec unit = inverse(add(one, exponential(mul(x, set(-1.0f)))));
-        Vec value = fma(load(ranges.slope + k), unit, load(ranges.start + k));
-        if (k < ranges.logarithmic) value = fma(load(ranges.factor + k), exponential(mul(load(ranges.rate + k), unit)), value);
-        store(raw + k, mul(value, fma(load(ranges.in_plane + k), set(fade - 1.0f), one)));
+        const Vec x = max(min(mul(load(raw + k), set(-1.44269504f)), set(120.0f)), set(-120.0f));
+        const Vec unit = inverse(add(one, exp2(x))), faded = fma(load(ranges.in_plane + k), set(fade - 1.0f), one);
+        Vec value = fma(mul(load(ranges.slope + k), faded), unit, mul(load(ranges.start + k), faded));
+        if (k < ranges.logarithmic) value = fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value);
+        store(raw + k, value);
     }
 }
 

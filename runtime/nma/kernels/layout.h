@@ -36,7 +36,7 @@ struct NetworkView {
     LayerView layers[DEEPEST_NETWORK];
 };
 
-// Numbers that a network's outputs become, of their sigmoids u: start + slope u + factor exp(rate u), and those `in_plane`
+// Numbers that a network's outputs become, of their sigmoids u: start + slope u + factor 2^(rate u), and those `in_plane`
 // times the fade towards normal incidence. All padded with zeros to `count`, a multiple of WIDTH_STEP that leaves room for
 // at least one of them; from `logarithmic` on all factors are 0.
 struct Ranges {

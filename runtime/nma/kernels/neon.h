@@ -19,6 +19,7 @@ NMA_OP Vec load(const float* p) { return vld1q_f32(p); }
 NMA_OP void store(float* p, Vec v) { vst1q_f32(p, v); }
 NMA_OP Vec set(float x) { return vdupq_n_f32(x); }
 NMA_OP Vec add(Vec a, Vec b) { return vaddq_f32(a, b); }
+NMA_OP Vec sub(Vec a, Vec b) { return vsubq_f32(a, b); }
 NMA_OP Vec mul(Vec a, Vec b) { return vmulq_f32(a, b); }
 NMA_OP Vec inverse(Vec a) { return vdivq_f32(set(1.0f), a); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return vfmaq_f32(c, a, b); }

@@ -46,10 +46,12 @@ NMA_OP void store(float* p, Vec v) { std::memcpy(p, &v, sizeof(v)); }
 NMA_OP Vec set(float x) { return each([&](int) { return x; }); }
 #if defined(__GNUC__)
 NMA_OP Vec add(Vec a, Vec b) { return a + b; }
+NMA_OP Vec sub(Vec a, Vec b) { return a - b; }
 NMA_OP Vec mul(Vec a, Vec b) { return a * b; }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return a * b + c; }
 #else
 NMA_OP Vec add(Vec a, Vec b) { return each([&](int k) { return a[k] + b[k]; }); }
+NMA_OP Vec sub(Vec a, Vec b) { return each([&](int k) { return a[k] - b[k]; }); }
 NMA_OP Vec mul(Vec a, Vec b) { return each([&](int k) { return a[k] * b[k]; }); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return each([&](int k) { return a[k] * b[k] + c[k]; }); }
 #endif
