@@ -71,22 +71,25 @@ private:
         const Four plain{p[0], p[1], p[2], sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
         // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
-        const Four n = Four(p[3], p[4], p[5], 1.0f) * inside, k = Four(p[6], p[7], p[8], 0.0f) * inside, k2 = k * k;
-        const Four less = n - one, more = n + one;
-        Four normal = (less * less + k2) / (more * more + k2), grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
-        Four albedo{p[9], p[10], p[11], 0.0f};
-        if (directional_) {
-            const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
-            normal.set(3, cosine);
-            grazing.set(3, fresnel);
-            albedo.set(3, std::exp(-sigma_t / maximum(cos_t, 0.05f)));
-        }
+        const Four n = four(p + 3) * inside, k = four(p + 6) * inside, k2 = k * k, less = n - one, more = n + one;
+        Four normal = (less * less + k2) / (more * more + k2), grazing = fresnel_conductor<Four>(Four(GRAZING), n, k), albedo = four(p + 9);
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
+        const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, 0.05f)), Four(-87.0f)));
+        normal.set(3, directional_ ? cosine : 0.0f);
+        grazing.set(3, directional_ ? fresnel : 0.0f);
+        albedo.set(3, directional_ ? transmitted[0] : 0.0f);
         const Four units[] = {(bent - start_) * per_range_, normal, grazing, albedo};
         for (const Four& unit : units) {
             const Four spread = unit * Four(2.0f) - one;
             std::memcpy(x, &spread, sizeof(spread));
             x += LANES;
         }
+    }
+
+    static Lanes<float> four(const float* p) {
+        Lanes<float> found;
+        std::memcpy(&found, p, sizeof(found));
+        return found;
     }
 
     Kind kind_ = Kind::Raw;

@@ -45,6 +45,8 @@ template <class T> inline Four<T> sums(const Four<T>& a, const Four<T>& b, const
 }
 template <class T> inline Four<T> logarithms(const Four<T>& a) { return each<T>([&](int k) { return std::log(a[k]); }); }
 
+template <class T> inline Four<T> exponentials(const Four<T>& a) { return each<T>([&](int k) { return std::exp(a[k]); }); }
+
 template <class T>
 struct Storage {
     using Type = Four<T>;
@@ -94,6 +96,15 @@ inline Floats logarithms(Floats a) {
     const Floats series = s2 * (0.666666667f + s2 * (0.4f + s2 * (0.285714286f + s2 * 0.222222222f)));
     return exponent * 0.693147181f + (2.0f * s + s * series);
 }
+
+// To two units in the last place for |a| <= 87: 2^n times the series of the rest, which is at most log(2) / 2.
+inline Floats exponentials(Floats a) {
+    const Floats octaves = a * 1.44269504f;
+    const Whole n = __builtin_convertvector(octaves + (octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f}), Whole);
+    const Floats whole = __builtin_convertvector(n, Floats), r = a - whole * 0.693145752f - whole * 1.42860677e-6f, r2 = r * r;
+    const Floats low = (1.0f + r) + r2 * (0.5f + r * 0.166666667f), high = (0.0416666667f + r * 0.00833333333f) + r2 * (0.00138888889f + r * 1.98412698e-4f);
+    return (low + high * (r2 * r2)) * (Floats)((n + 127) << 23);
+}
 #endif
 
 }  // namespace detail
@@ -125,6 +136,7 @@ template <class T> inline Lanes<T> minimum(const Lanes<T>& a, const Lanes<T>& b)
 template <class T> inline Lanes<T> maximum(const Lanes<T>& a, const Lanes<T>& b) { return detail::most(a.v, b.v); }
 template <class T> inline Lanes<T> sqrt(const Lanes<T>& a) { return detail::roots(a.v); }
 template <class T> inline Lanes<T> log(const Lanes<T>& a) { return detail::logarithms(a.v); }
+template <class T> inline Lanes<T> exp(const Lanes<T>& a) { return detail::exponentials(a.v); }
 template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(maximum(a, Lanes<T>(T(0)))); }
 
 template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
