@@ -89,7 +89,7 @@ def fresnel_conductor(cos_i: Float, eta: Float, k: Float) -> Float:
     r_s = (t1 - t2) / (t1 + t2)
     t3 = cos2 * a2b2 + sin2 * sin2 + 1e-30  # an index of 0 + 0i reflects everything, at normal incidence too
     t4 = t2 * sin2
-    r_p = r_s * (t3 - t4) / (t3 + t4)
+    r_p = r_s * ((t3 - t4) / (t3 + t4))
     return 0.5 * (r_s + r_p)
 
 

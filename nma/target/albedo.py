@@ -76,8 +76,9 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
     alpha = ops.minimum(alpha_x, alpha_y)  # the direction in which facets tilt least
     tilt = 0.62 * alpha / (alpha + 0.35)
-    facet = ops.minimum(ops.sqrt(cos * cos + tilt * tilt), 1.0)
-    fresnel = spec_fresnel(p, facet, schlick_weight(facet))
+    facet2 = ops.minimum(cos * cos + tilt * tilt, 1.0)
+    facet = ops.sqrt(facet2)
+    fresnel = spec_fresnel(p, facet, facet2, schlick_weight(facet))
     unmasked = ops.minimum(1.1 - alpha * (0.33 + 0.385 * cos), 1.0)
     return (p.base_color * fresnel.colored + fresnel.white) * unmasked + SPEC_MARGIN
 

@@ -138,10 +138,10 @@ def specular_eta(specular: Float) -> Float:
     return 2.0 / (1.0 - ops.safe_sqrt(specular_f0(specular))) - 1.0
 
 
-def dielectric_reflectance(cos: Float, eta: Float) -> Float:
+def dielectric_reflectance(cos: Float, cos2: Float, eta: Float) -> Float:
     """Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Walter 2007, eq. 22."""
     eta2 = eta * eta
-    g = ops.sqrt(ops.maximum(eta2 - 1.0 + cos * cos, 1e-12))
+    g = ops.sqrt(ops.maximum(eta2 - 1.0 + cos2, 1e-12))
     r_s = (cos - g) / (cos + g)
     r_p = (eta2 * cos - g) / (eta2 * cos + g)
     return 0.5 * (r_s * r_s + r_p * r_p)
@@ -178,13 +178,14 @@ def diffuse_terms(p: Principled, g: Geometry) -> Terms:
     return Terms(colored + tinted * luminance_inverse(p.base_color), sheen - tinted)
 
 
-def spec_fresnel(p: Principled, cos: Float, weight: Float) -> Terms:
-    """Fresnel reflectance of metal, tinted and plain dielectric together. `weight` is `schlick_weight(cos)`."""
+def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms:
+    """Fresnel reflectance of metal, tinted and plain dielectric together. `cos2` is cos^2, which a caller may know before
+    the root that is `cos`; `weight` is `schlick_weight(cos)`."""
     tinted = (1.0 - p.metallic) * p.spec_tint
     plain = (1.0 - p.metallic) - tinted
     # Schlick's F0 + (1 - F0) weight for both coloured parts, collected.
     f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
-    white = plain * dielectric_reflectance(cos, specular_eta(p.specular)) + (p.metallic + tinted) * weight
+    white = plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight
     return Terms(f0 * (1.0 - weight), white)
 
 
@@ -207,7 +208,7 @@ def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     clearcoat = p.clearcoat * clearcoat_d * g.clearcoat
     # Every lobe is the base colour times one number plus another.
     diffuse = diffuse_terms(p, g)
-    fresnel = spec_fresnel(p, g.cos_d, g.weight_d)
+    fresnel = spec_fresnel(p, g.cos_d, g.cos_d * g.cos_d, g.weight_d)
     left = faded(p, g.h.z)
     colored = left * (diffuse.colored + spec * fresnel.colored)
     white = left * (diffuse.white + spec * fresnel.white + clearcoat)

@@ -146,7 +146,7 @@ inline T fresnel_conductor(T cos_i, T eta, T k) {
     const auto r_s = (t1 - t2) / (t1 + t2);
     const auto t3 = cos2 * a2b2 + sin2 * sin2 + T(1e-30);
     const auto t4 = t2 * sin2;
-    const auto r_p = r_s * (t3 - t4) / (t3 + t4);
+    const auto r_p = r_s * ((t3 - t4) / (t3 + t4));
     return T(0.5) * (r_s + r_p);
 }
 
@@ -215,9 +215,9 @@ inline T specular_eta(T specular) {
 
 // Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Walter 2007, eq. 22.
 template <class T>
-inline T dielectric_reflectance(T cos, T eta) {
+inline T dielectric_reflectance(T cos, T cos2, T eta) {
     const auto eta2 = eta * eta;
-    const auto g = sqrt(maximum(eta2 - T(1.0) + cos * cos, T(1e-12)));
+    const auto g = sqrt(maximum(eta2 - T(1.0) + cos2, T(1e-12)));
     const auto r_s = (cos - g) / (cos + g);
     const auto r_p = (eta2 * cos - g) / (eta2 * cos + g);
     return T(0.5) * (r_s * r_s + r_p * r_p);
@@ -254,14 +254,15 @@ inline Terms<T> diffuse_terms(const Principled<T>& p, const Geometry<T>& g) {
     return Terms<T>{colored + tinted * luminance_inverse<T>(p.base_color), sheen - tinted};
 }
 
-// Fresnel reflectance of metal, tinted and plain dielectric together. `weight` is `schlick_weight(cos)`.
+// Fresnel reflectance of metal, tinted and plain dielectric together. `cos2` is cos^2, which a caller may know
+// before the root that is `cos`; `weight` is `schlick_weight(cos)`.
 template <class T>
-inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T weight) {
+inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     const auto tinted = (T(1.0) - p.metallic) * p.spec_tint;
     const auto plain = T(1.0) - p.metallic - tinted;
     const auto f0 = p.metallic + tinted * specular_f0<T>(p.specular) * luminance_inverse<T>(p.base_color);
-    const auto white = plain * dielectric_reflectance<T>(cos, specular_eta<T>(p.specular)) + (p.metallic +
-        tinted) * weight;
+    const auto white = plain * dielectric_reflectance<T>(cos, cos2, specular_eta<T>(p.specular)) + (p.metallic
+        + tinted) * weight;
     return Terms<T>{f0 * (T(1.0) - weight), white};
 }
 
@@ -283,7 +284,7 @@ inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     const auto clearcoat_pdf = clearcoat_d * g.h.z / (T(4.0) * g.cos_d);
     const auto clearcoat = p.clearcoat * clearcoat_d * g.clearcoat;
     const auto diffuse = diffuse_terms<T>(p, g);
-    const auto fresnel = spec_fresnel<T>(p, g.cos_d, g.weight_d);
+    const auto fresnel = spec_fresnel<T>(p, g.cos_d, g.cos_d * g.cos_d, g.weight_d);
     const auto left = faded<T>(p, g.h.z);
     const auto colored = left * (diffuse.colored + spec * fresnel.colored);
     const auto white = left * (diffuse.white + spec * fresnel.white + clearcoat);
@@ -315,8 +316,9 @@ inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
     const auto alpha = minimum(alpha_x, alpha_y);
     const auto tilt = T(0.62) * alpha / (alpha + T(0.35));
-    const auto facet = minimum(sqrt(cos * cos + tilt * tilt), T(1.0));
-    const auto fresnel = spec_fresnel<T>(p, facet, schlick_weight<T>(facet));
+    const auto facet2 = minimum(cos * cos + tilt * tilt, T(1.0));
+    const auto facet = sqrt(facet2);
+    const auto fresnel = spec_fresnel<T>(p, facet, facet2, schlick_weight<T>(facet));
     const auto unmasked = minimum(T(1.1) - alpha * (T(0.33) + T(0.385) * cos), T(1.0));
     return (p.base_color * fresnel.colored + fresnel.white) * unmasked + SPEC_MARGIN<T>;
 }
