@@ -11,13 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from nma import ops
-from nma.ops import Color, Float, Vec3
+from nma.ops import Color, Float
 from nma.target.principled import (
     CLEARCOAT_F0,
     CLEARCOAT_MASKING_ALPHA,
     Principled,
     luminance_inverse,
-    masking_denominator,
     schlick_weight,
     spec_alpha,
     spec_fresnel,
@@ -85,7 +84,9 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
 
 def clearcoat_albedo(p: Principled, cos: Float, weight: Float) -> Float:
     """The clearcoat as if it were a mirror; it fades at grazing for lack of 1 / (4 cos_i cos_o)."""
-    wi = Vec3(ops.safe_sqrt(1.0 - cos * cos), 0.0, cos)
-    masking = 2.0 * cos / masking_denominator(wi, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
+    # `masking_denominator` without the root that is sin(theta_i).
+    cos2 = cos * cos
+    alpha2 = CLEARCOAT_MASKING_ALPHA * CLEARCOAT_MASKING_ALPHA
+    masking = 2.0 * cos / (cos + ops.sqrt(cos2 + alpha2 * (1.0 - cos2)))
     fresnel = CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * weight
-    return p.clearcoat * (fresnel * cos * cos * masking * masking + CLEARCOAT_MARGIN)
+    return p.clearcoat * (fresnel * cos2 * masking * masking + CLEARCOAT_MARGIN)

@@ -326,11 +326,11 @@ inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
 // The clearcoat as if it were a mirror; it fades at grazing for lack of 1 / (4 cos_i cos_o).
 template <class T>
 inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
-    const auto wi = Vec3<T>{safe_sqrt(T(1.0) - cos * cos), T(0.0), cos};
-    const auto masking = T(2.0) * cos / masking_denominator<T>(wi, CLEARCOAT_MASKING_ALPHA<T>,
-        CLEARCOAT_MASKING_ALPHA<T>);
+    const auto cos2 = cos * cos;
+    const auto alpha2 = CLEARCOAT_MASKING_ALPHA<T> * CLEARCOAT_MASKING_ALPHA<T>;
+    const auto masking = T(2.0) * cos / (cos + sqrt(cos2 + alpha2 * (T(1.0) - cos2)));
     const auto fresnel = CLEARCOAT_F0<T> + (T(1.0) - CLEARCOAT_F0<T>) * weight;
-    return p.clearcoat * (fresnel * cos * cos * masking * masking + CLEARCOAT_MARGIN<T>);
+    return p.clearcoat * (fresnel * cos2 * masking * masking + CLEARCOAT_MARGIN<T>);
 }
 
 // Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0, and nothing fades.
