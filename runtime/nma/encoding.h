@@ -67,23 +67,29 @@ private:
         using Four = Lanes<float>;
         constexpr float GRAZING = 0.1045f;
         const float sigma_t = p[12];
-        const Four one(1.0f), inside(1.0f / p[2]);
-        const Four plain{p[0], p[1], p[2], sigma_t};
-        const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
-        // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
-        const Four n = four(p + 3) * inside, k = four(p + 6) * inside, k2 = k * k, less = n - one, more = n + one;
-        Four normal = (less * less + k2) / (more * more + k2), grazing = fresnel_conductor<Four>(Four(GRAZING), n, k), albedo = four(p + 9);
+        // First what takes longest.
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
         const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, 0.05f)), Four(-87.0f)));
+        const Four one(1.0f), inside(1.0f / p[2]);
+        const Four n = four(p + 3) * inside, k = four(p + 6) * inside, k2 = k * k, less = n - one, more = n + one;
+        Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
+        // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
+        Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + 9);
+        const Four plain{p[0], p[1], p[2], sigma_t};
+        const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
         normal.set(3, directional_ ? cosine : 0.0f);
         grazing.set(3, directional_ ? fresnel : 0.0f);
         albedo.set(3, directional_ ? transmitted[0] : 0.0f);
-        const Four units[] = {(bent - start_) * per_range_, normal, grazing, albedo};
-        for (const Four& unit : units) {
-            const Four spread = unit * Four(2.0f) - one;
-            std::memcpy(x, &spread, sizeof(spread));
-            x += LANES;
-        }
+        put(x, (bent - start_) * per_range_);
+        put(x + LANES, normal);
+        put(x + 2 * LANES, grazing);
+        put(x + 3 * LANES, albedo);
+    }
+
+    // Four numbers, from 0 .. 1 to -1 .. 1.
+    static void put(float* x, const Lanes<float>& units) {
+        const Lanes<float> spread = units * Lanes<float>(2.0f) - Lanes<float>(1.0f);
+        std::memcpy(x, &spread, sizeof(spread));
     }
 
     static Lanes<float> four(const float* p) {
