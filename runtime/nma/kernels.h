@@ -101,7 +101,7 @@ inline const Kernels& kernels(InstructionSet set) {
     if (!supported(set)) return PORTABLE;
 #if defined(NMA_X86)
     static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::encode, avx2::finish, avx2::prepare<avx2::forward>};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512::forward_narrow>};
+    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many, avx512::encode, avx512::finish, avx512::prepare_either};
     static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512_bf16::forward>};
     if (set == InstructionSet::avx2) return AVX2;
     if (set == InstructionSet::avx512) return AVX512;

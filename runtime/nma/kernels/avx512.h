@@ -43,7 +43,8 @@ struct Few {
     static constexpr int MOST = 2 * LANES;
     Vec low, high;
 
-    NMA_FN explicit Few(const float* all) : low(load(all)), high(load(all + LANES)) {}
+    NMA_FN Few(Vec a, Vec b) : low(a), high(b) {}
+    NMA_FN explicit Few(const float* all) : Few(load(all), load(all + LANES)) {}
     NMA_FN nma::Lanes<float> operator()(const int* index) const {
         const __m512i four = _mm512_castsi128_si512(_mm_loadu_si128(reinterpret_cast<const __m128i*>(index)));
         return (detail::Floats)_mm512_maskz_extractf32x4_ps(0xf, _mm512_permutex2var_ps(low, four, high), 0);
@@ -53,7 +54,7 @@ struct Few {
 #include "body.inl"
 
 // A column's four numbers from `p` on, or from block B of a vector on, in all blocks of four lanes.
-NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_load_ps(p)); }
+NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_loadu_ps(p)); }
 template <int B>
 NMA_OP Vec repeat(Vec v) { return _mm512_maskz_shuffle_f32x4(ALL, v, v, B * 0x55); }
 // Lane k of each block of four becomes lane (k + R) % 4.
@@ -85,13 +86,35 @@ NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     }
 }
 
+NMA_OP void narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]) {
+    first_layer(view.layers[0], inputs, y);
+    for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
+}
+
 NMA_FN inline void forward_narrow(const NetworkView& view, const float* inputs, float* outputs) {
     if (!view.narrow) return forward(view, inputs, outputs);
     Vec y[2];
-    first_layer(view.layers[0], inputs, y);
-    for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
+    narrow(view, inputs, y);
     store(outputs, y[0]);
     store(outputs + LANES, y[1]);
+}
+
+NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
+    alignas(64) float inputs[WIDEST_LAYER], numbers[NARROW];
+    Vec y[2];
+    encode(recipe, parameters, cosine, inputs);
+    narrow(recipe.network, inputs, y);
+    NMA_UNROLL for (int v = 0; v < 2; ++v) {
+        y[v] = decoded(recipe.ranges, v * LANES, y[v], 1.0f - cosine * cosine);
+        store(numbers + v * LANES, y[v]);
+    }
+    assemble(recipe, numbers, Few(y[0], y[1]), blend);
+    weigh(blend, cosine, recipe.bounded);
+}
+
+NMA_FN inline void prepare_either(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
+    if (recipe.network.narrow) return prepare_narrow(recipe, parameters, cosine, blend);
+    prepare<forward>(recipe, parameters, cosine, blend);
 }
 
 }  // namespace nma::avx512

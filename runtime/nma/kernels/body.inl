@@ -90,16 +90,13 @@ NMA_OP Vec exp2(Vec x) {
     return scale(fma(high, mul(r2, r2), low), n);
 }
 
-// Raw outputs to numbers of the target, in place. Twin of nma/target/decode.py.
-NMA_OP void decode(const Ranges& ranges, float* raw, float fade) {
-    const Vec one = set(1.0f);
-    for (int k = 0; k < ranges.count; k += LANES) {
-        const Vec x = max(min(mul(load(raw + k), set(-1.44269504f)), set(120.0f)), set(-120.0f));
-        const Vec unit = inverse(add(one, exp2(x))), faded = fma(load(ranges.in_plane + k), set(fade - 1.0f), one);
-        Vec value = fma(mul(load(ranges.slope + k), faded), unit, mul(load(ranges.start + k), faded));
-        if (k < ranges.logarithmic) value = fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value);
-        store(raw + k, value);
-    }
+// Raw outputs from number k on to numbers of the target. Twin of nma/target/decode.py.
+NMA_OP Vec decoded(const Ranges& ranges, int k, Vec raw, float fade) {
+    const Vec one = set(1.0f), faded = fma(load(ranges.in_plane + k), set(fade - 1.0f), one);
+    const Vec x = max(min(mul(raw, set(-1.44269504f)), set(120.0f)), set(-120.0f));
+    const Vec unit = inverse(add(one, exp2(x)));
+    const Vec value = fma(mul(load(ranges.slope + k), faded), unit, mul(load(ranges.start + k), faded));
+    return k < ranges.logarithmic ? fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value) : value;
 }
 
 NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameters, float cosine, float* inputs) {
@@ -107,7 +104,7 @@ NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameter
 }
 
 NMA_FN NMA_WHOLE inline void finish(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
-    decode(recipe.ranges, raw, 1.0f - cosine * cosine);
+    for (int k = 0; k < recipe.ranges.count; k += LANES) store(raw + k, decoded(recipe.ranges, k, load(raw + k), 1.0f - cosine * cosine));
     if (recipe.ranges.count <= Few::MOST) assemble(recipe, raw, Few(raw), blend);
     else assemble(recipe, raw, Indexed(raw), blend);
     weigh(blend, cosine, recipe.bounded);
