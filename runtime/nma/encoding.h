@@ -2,6 +2,7 @@
 // nma/encoding.py.
 #pragma once
 
+#include "kernels/macros.h"
 #include "lanes.h"
 #include "target.h"
 #include "weights.h"
@@ -63,7 +64,7 @@ private:
     // Four scalars, three colours, and in the fourth lanes of those what depends on the direction.
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
 
-    void layered3(const float* p, float cosine, float* x) const {
+    NMA_INLINE void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;
         constexpr float GRAZING = 0.1045f;
         const float sigma_t = p[12];

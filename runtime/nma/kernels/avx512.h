@@ -1,6 +1,7 @@
 // x86-64 with AVX-512 F, BW, DQ and VL: sixteen lanes, 32 registers.
 #pragma once
 
+#include <cstring>
 #include <immintrin.h>
 
 #include "../recipe.h"
@@ -47,7 +48,10 @@ struct Few {
     NMA_FN explicit Few(const float* all) : Few(load(all), load(all + LANES)) {}
     NMA_FN nma::Lanes<float> operator()(const int* index) const {
         const __m512i four = _mm512_castsi128_si512(_mm_loadu_si128(reinterpret_cast<const __m128i*>(index)));
-        return (detail::Floats)_mm512_maskz_extractf32x4_ps(0xf, _mm512_permutex2var_ps(low, four, high), 0);
+        const __m128 numbers = _mm512_maskz_extractf32x4_ps(0xf, _mm512_permutex2var_ps(low, four, high), 0);
+        nma::Lanes<float> found;
+        std::memcpy(&found, &numbers, sizeof(found));
+        return found;
     }
 };
 
