@@ -20,7 +20,7 @@ constexpr int MOST_TOGETHER = 8;
 // where each number holds the weights of inputs 2 i (low half) and 2 i + 1 (high half) as bfloat16: half the memory,
 // which is what a single query waits for.
 //
-// Networks of little more than two vectors have `turned` too, which takes four inputs at once as they lie, again and again:
+// Narrow networks have `turned` too, for single queries on AVX-512: it takes four inputs at once as they lie, again and again:
 // column 4 b + r holds, at neuron 4 g + k, what input 4 b + k adds to neuron 4 g + (k + r) % 4. The sum over all b is turned
 // by r once, at its end. All columns of the first WIDTH_STEP neurons come first, then those of the next.
 struct LayerView {
