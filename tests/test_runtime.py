@@ -21,6 +21,7 @@ from nma.export.classes import classes
 from nma.export.cpp import cpp, print_function
 from nma.export.functions import Unsupported, parsed
 from nma.ops import Vec3
+from nma.params import MEASURED
 
 ROOT = Path(__file__).parent.parent
 FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
@@ -233,6 +234,26 @@ def test_an_adapter_evaluates_like_the_package(library):
         with Loaded(library, stored("layered3-3x32"), instruction_set) as loaded:
             found = loaded.eval(loaded.prepare(params, np.ascontiguousarray(wi.T[2])), wi, wo)
         # Errors of the network's outputs, 1e-5, are multiplied by sharp lobes.
+        np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("hidden", ([32, 32, 32], [8]))
+def test_an_adapter_of_a_single_material_evaluates_like_the_package(library, tmp_path, hidden):
+    """No parameters, one input, and lobes that are stretched in the plane of incidence, flattened and faded."""
+    rng, size = np.random.default_rng(14), target.output_size(2, target.MEASURED_PARAMS)
+    layers = network.init(rng, [1, *hidden, size], rng.normal(size=size))
+    adapter = nma.Adapter(MEASURED, "direction", layers, 2, True, target.MEASURED_PARAMS)
+    adapter.save(tmp_path / "single.safetensors")
+    wi, wo = (rows(random_directions(rng, CASES)).astype(np.float32) for _ in range(2))
+    plane = target.Plane.of(Vec3(*wi.T))
+    blend = adapter.prepare([], wi.T[2])
+    value, pdf = target.eval_pdf(blend, *(plane.enter(Vec3(*w.T)) for w in (wi, wo)))
+    assert 0.05 < (value.x == 0).mean() < 0.95
+    for instruction_set in available(library, SETS[1:-1]):
+        with Loaded(library, (tmp_path / "single.safetensors").read_bytes(), instruction_set) as loaded:
+            assert library.nma_parameter_count(loaded.handle) == 0
+            materials = loaded.prepare(np.zeros((CASES, 0), np.float32), np.ascontiguousarray(wi.T[2]))
+            found = loaded.eval(materials, wi, wo)
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 
