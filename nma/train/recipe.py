@@ -129,12 +129,14 @@ MEASURED = replace(
     rows=512,
     bins_per_row=64,
     points=1,
+    energy=0.02,
+    albedo=0.1,
     albedo_samples=4,
     loss="log",
     schedule="onecycle",
-    learning_rate=7e-3,
+    learning_rate=1e-2,
     average=0.0,
-    steps=10_000,
+    steps=16_000,
 )
 # The same where it matters how the material is turned.
 ANISOTROPIC = replace(
