@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from nma import sources
 from nma.params import SPACES, Param, ParamSpace
 
 _HEAD = """\
@@ -31,8 +32,8 @@ def classes() -> str:
 
 
 def _simulated() -> list[tuple[str, ParamSpace]]:
-    """Classes with parameters to describe a material by."""
-    return [(name, space) for name, space in SPACES.items() if space.params]
+    """Classes with a source that the runtime may have, too."""
+    return [(name, SPACES[name]) for name in sources.names()]
 
 
 def _row(param: Param) -> str:

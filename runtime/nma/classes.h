@@ -18,9 +18,4 @@ inline std::vector<SourceParam> layered3_parameters() {
         {"sigma_t", 1, false, 0.0, 1e+30, 0.0f, 1.0f}};
 }
 
-inline std::vector<SourceParam> library_parameters() {
-    return {
-        {"code", 32, false, -4.0, 4.0, 0.0f, 1.0f}};
-}
-
 }  // namespace nma

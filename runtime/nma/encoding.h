@@ -58,6 +58,7 @@ private:
         if (name == "raw") return Kind::Raw;
         if (name == "direction") return Kind::Direction;
         if (name == "layered3") return Kind::Layered3;
+        if (name == "azimuth") throw Error("an anisotropic adapter, which the runtime does not evaluate; Mitsuba's BSDF `nma` does");
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
