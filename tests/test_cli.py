@@ -158,6 +158,21 @@ def test_render_knows_the_bsdfs_in_a_scene_file(nma, weights, tmp_path, bsdf):
     assert read_image(tmp_path / "b.exr").shape == (12, 12, 3)
 
 
+def test_a_bsdf_is_fitted_and_rendered(nma, tmp_path):
+    bsdf, fit = tmp_path / "matte.xml", tmp_path / "matte.safetensors"
+    bsdf.write_text('<bsdf version="3.0.0" type="diffuse"/>')
+    options = ("--network", "1x8", "--steps", "20", "--albedo", "0")
+    status, _, err = nma("fit", bsdf, "-o", fit, *options)
+    assert status == 0, err
+    assert "at 20,000 pairs of directions: log_loss" in err
+    status, _, err = nma("render", fit, "-o", tmp_path / "matte.png", "--size", "16", "--spp", "1")
+    assert status == 0, err
+    assert (tmp_path / "matte.png").is_file()
+    status, _, err = nma("render", fit, "--model", "layered")
+    assert status == 2
+    assert "--model cannot be used with an adapter" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -144,7 +144,9 @@ def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
         np.testing.assert_array_equal(matrix, before)
         np.testing.assert_array_equal(bias, bias_before)
     # Each that the library knows is nearest to itself.
-    nearest = [np.argmin(training._judge(library.codes, library, tables[k : k + 1], recipe)) for k in range(3)]
+    nearest = [
+        np.argmin(training._judge(library.codes, library, tables[k : k + 1], recipe)) for k in range(3)
+    ]
     assert nearest == [0, 1, 2]
     with pytest.raises(TableError, match="one table"):
         training.encode(library, tables, recipe=recipe)
