@@ -1,6 +1,7 @@
 """Libraries: many materials in one network, their file, codes of new materials, and the folders they come from."""
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_type=ImportError)
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
 
-from nma import collection, network
+from nma import cli, collection, network
 from nma.adapter import Adapter
 from nma.errors import NmaError, ParamError, SourceError, TableError, WeightsError
 from nma.evaluate import evaluate
@@ -37,6 +38,7 @@ TINY = replace(
     average=0.9,
     steps=250,
 )
+CODING = replace(TINY, steps=150, learning_rate=5e-2)
 # What 250 steps must reach; they start above .02.
 REACHED = 0.003
 
@@ -134,8 +136,7 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(made, tables, tmp_path,
 
 def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
     layers = [(matrix.copy(), bias.copy()) for matrix, bias in library.adapter.layers]
-    recipe = replace(TINY, steps=150, learning_rate=5e-2)
-    found = training.encode(library, tables[3:], recipe=recipe)
+    found = training.encode(library, tables[3:], recipe=CODING)
     assert found.nearest in NAMES
     assert found.log_loss < 0.7 * found.nearest_log_loss
     assert found.code.shape == (32,)
@@ -145,11 +146,11 @@ def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
         np.testing.assert_array_equal(bias, bias_before)
     # Each that the library knows is nearest to itself.
     nearest = [
-        np.argmin(training._judge(library.codes, library, tables[k : k + 1], recipe)) for k in range(3)
+        np.argmin(training._judge(library.codes, library, tables[k : k + 1], CODING)) for k in range(3)
     ]
     assert nearest == [0, 1, 2]
     with pytest.raises(TableError, match="one table"):
-        training.encode(library, tables, recipe=recipe)
+        training.encode(library, tables, recipe=CODING)
 
 
 def test_mixtures_and_single_materials(library):
@@ -270,3 +271,41 @@ def test_tables_are_kept_until_their_file_changes(folder, tmp_path, monkeypatch)
         kept.write_bytes(b"damaged")
     collection.tables(members, tmp_path / "tables")
     assert len(made) == 5
+
+
+def test_the_commands(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(training, "RECIPE", TINY)
+    monkeypatch.setattr(training, "ENCODING", CODING)
+    made, more, one = (tmp_path / "new" / f"{name}.safetensors" for name in ("made", "more", "one"))
+
+    def nma(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+            sys.exit(0)
+        return end.value.code or 0, *capsys.readouterr()
+
+    code, out, err = nma("train-library", folder, "-o", made)
+    assert code == 0, err
+    library = Library.load(made)
+    assert out.startswith(f"3 materials (*.xml), {library.parameters:,} parameters: 96 of codes")
+    assert {p.name for p in made.parent.iterdir()} == {made.name, f"{made.name}.tables", "made.loss.png"}
+    assert nma("library", "list", made)[:2] == (0, "blue\ngreen\nred\n")
+    xml(tmp_path / "brown.xml", COLOURS[3])
+    code, out, err = nma("library", "encode", made, tmp_path / "brown.xml", "-o", more)
+    assert code == 0, err
+    assert out.startswith("brown: log loss 0.00")
+    np.testing.assert_array_equal(Library.load(more).codes[:3], library.codes)
+    assert nma("library", "extract", more, "brown=.5", "red", "-o", one)[0] == 0
+    np.testing.assert_allclose(
+        Adapter.load(one).training["code"], Library.load(more).mix(["brown", "red"], [1, 2]), rtol=1e-5
+    )
+    for arguments, words in (
+        (("library", "encode", more, tmp_path / "brown.xml", "-o", more), "has a material 'brown'; give"),
+        (("library", "extract", more, "pink", "-o", one), "no material 'pink'"),
+        (("library", "list", one), "not a library"),
+        (("train-library", tmp_path / "nowhere", "-o", one), "no such folder or file"),
+    ):
+        code, out, err = nma(*arguments)
+        assert (code, out, err.count("\n")) == (1, "", 1)
+        assert words in err
