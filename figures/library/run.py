@@ -42,8 +42,10 @@ DATA = common.ROOT.parent / "shared/data"
 NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"
 NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
 # Top left, top right, bottom left, bottom right: a metal, a paint, a matte material and a plastic.
-CORNERS = ("brass", "color-changing-paint2", "pink-fabric", "green-plastic")
+CORNERS = ("brass", "color-changing-paint2", "white-fabric", "red-specular-plastic")
 CELLS = 7
+# Stops that brighten the sheet; FLIP is of the pictures as they are.
+EXPOSURE = 1.0
 # Cosines in each row of a table at which an adapter runs to be compared with it.
 DIRECTIONS = 16
 # Correlated multi-jittered samples, as in figures/rendered.
@@ -98,9 +100,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--held-out", type=int, default=10, help="materials that a second library does not see"
     )
-    parser.add_argument("--size", type=int, default=96, help="of the pictures, in pixels")
+    parser.add_argument("--size", type=int, default=128, help="of the pictures, in pixels")
     parser.add_argument("--spp", type=int, default=256, help="samples per pixel of the mixtures")
-    parser.add_argument("--reference-spp", type=int, default=2048, help="of fits and references")
+    parser.add_argument("--reference-spp", type=int, default=1024, help="of fits and references")
     arguments = parser.parse_args()
     vars(arguments).update(settings={}, encoding_steps=training.ENCODING.steps, corners=CORNERS)
     if arguments.quick:
@@ -280,7 +282,7 @@ def sheet(pictures: dict[str, Any], flips: list[dict[str, Any]], path: Path) -> 
 
 
 def show(axes: Any, image: NDArray[np.float32]) -> None:
-    axes.imshow(tonemap(image, shoulder=0.8), interpolation="lanczos")
+    axes.imshow(tonemap(image, exposure=EXPOSURE, shoulder=0.8), interpolation="lanczos")
 
 
 if __name__ == "__main__":

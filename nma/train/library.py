@@ -35,7 +35,7 @@ RECIPE = Recipe(
     albedo=0.3,
     learning_rate=1e-2,
     average=0.999,
-    steps=40_000,
+    steps=60_000,
 )
 
 # One code: the network is known, so that a thousand steps do.
