@@ -42,7 +42,7 @@ DATA = common.ROOT.parent / "shared/data"
 NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"
 NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
 # Top left, top right, bottom left, bottom right: a metal, a paint, a matte material and a plastic.
-CORNERS = ("brass", "color-changing-paint2", "white-fabric", "red-specular-plastic")
+CORNERS = ("brass", "color-changing-paint2", "pink-fabric", "green-plastic")
 CELLS = 7
 # Stops that brighten the sheet; FLIP is of the pictures as they are.
 EXPOSURE = 1.0
