@@ -2,11 +2,12 @@
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from nma import llvm
+from nma import cli, llvm
 
 
 @pytest.fixture
@@ -41,3 +42,18 @@ def measurements() -> Path:
     if not folder.is_dir():
         pytest.skip(f"there are no measured materials in {folder}; `nma data` says where they come from")
     return folder
+
+
+@pytest.fixture
+def nma(monkeypatch, capsys):
+    """Runs `nma ARGUMENTS` in this process: exit status, stdout, stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+            sys.exit(0)
+        return end.value.code or 0, *capsys.readouterr()
+
+    return run

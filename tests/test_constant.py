@@ -1,14 +1,13 @@
 """One plain Principled BRDF for a material: the fit, its export to Mitsuba, and `nma principled`."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from target_cases import random_directions, random_principled, stacked
 
-from nma import cli, sources
+from nma import sources
 from nma.adapter import Adapter
 from nma.errors import ParamError, TableError
 from nma.evaluate import tabulate_adapter
@@ -128,21 +127,6 @@ def test_what_mitsuba_does_not_allow_is_refused(change):
 
 
 # ---- The command -----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def nma(monkeypatch, capsys):
-    """Runs `nma ARGUMENTS` in this process: exit status, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-            sys.exit(0)
-        return end.value.code or 0, *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture

@@ -1,12 +1,11 @@
 """`nma data`: what it says of the data sets, and that it finds what is wrong with a copy."""
 
 import shutil
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
-from nma import cli
 from nma.errors import SourceError
 from nma.sources import datasets, merl
 from nma.sources.datasets import DATASETS
@@ -14,17 +13,9 @@ from nma.sources.merl import Merl
 
 
 @pytest.fixture
-def data(monkeypatch, capsys):
+def data(nma):
     """Runs `nma data ARGUMENTS`: exit status, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["nma", "data", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-            sys.exit(0)
-        return end.value.code or 0, *capsys.readouterr()
-
-    return run
+    return partial(nma, "data")
 
 
 @pytest.fixture

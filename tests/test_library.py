@@ -1,7 +1,6 @@
 """Libraries: many materials in one network, their file, codes of new materials, and the folders they come from."""
 
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_type=ImportError)
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
 
-from nma import cli, collection, network
+from nma import collection, network
 from nma.adapter import Adapter
 from nma.errors import NmaError, ParamError, SourceError, TableError, WeightsError
 from nma.evaluate import evaluate
@@ -273,17 +272,10 @@ def test_tables_are_kept_until_their_file_changes(folder, tmp_path, monkeypatch)
     assert len(made) == 5
 
 
-def test_the_commands(folder, tmp_path, monkeypatch, capsys):
+def test_the_commands(nma, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "RECIPE", TINY)
     monkeypatch.setattr(training, "ENCODING", CODING)
     made, more, one = (tmp_path / "new" / f"{name}.safetensors" for name in ("made", "more", "one"))
-
-    def nma(*arguments):
-        monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-            sys.exit(0)
-        return end.value.code or 0, *capsys.readouterr()
 
     code, out, err = nma("train-library", folder, "-o", made)
     assert code == 0, err
