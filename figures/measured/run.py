@@ -29,6 +29,7 @@ from nma.adapter import Adapter
 from nma.cli.console import TrainingBar
 from nma.contact_sheet import Row, contact_sheet
 from nma.image_metrics import flip_map
+from nma.ops import Vec3
 from nma.pairs import Pairs, compare
 from nma.render.values_bsdf import bsdf_of
 from nma.sources.adapter import AdapterValues
@@ -85,9 +86,9 @@ def main() -> None:
     rows, pictures = [], []
     for material in chosen:
         adapter, seconds = fitted(material, arguments.steps, kept)
-        row = judged(material, adapter, seconds, arguments.constant_steps)
         own, errors = rendered(material, adapter, kept, arguments)
-        rows.append(row | errors)
+        models = alternatives(material, adapter, arguments.constant_steps, kept)
+        rows.append({"name": material.name, "seconds": seconds, "models": judged(material, models)} | errors)
         pictures.append(Row(material.name, own, ("itself", "fit", f"FLIP {errors['flip_ldr']:.4f}")))
         print(rows[-1], flush=True)
     text = markdown(rows)
@@ -138,7 +139,7 @@ def materials(data: Path) -> list[Material]:
 def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, float]:
     """The adapter as `nma fit` makes it, and the seconds that took, compilation included."""
     recipe = recipe_for(material.source, steps=steps)
-    path = kept / f"{material.name.replace(' ', '-')}_{recipe.steps}.safetensors"
+    path = kept / f"{slug(material)}_{recipe.steps}.safetensors"
     if not path.exists():
         began = time.perf_counter()
         with TrainingBar(recipe, material.name) as bar:
@@ -149,61 +150,82 @@ def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, 
     return adapter, adapter.training["wall_seconds"]
 
 
-def judged(material: Material, adapter: Adapter, seconds: float, constant_steps: int) -> dict[str, Any]:
-    """Figures, sizes and times of the fit and of its alternatives."""
-    own = AdapterValues(adapter)
-    row: dict[str, Any] = {"name": material.name, "seconds": seconds}
-    row |= figures("fit", own, network.parameters(adapter.layers), material.source)
-    if material.source.isotropic:
-        recipe = replace(CONSTANT, steps=constant_steps)
-        constant = fit_constant(tabulate_values(material.source), recipe).adapter
-        row |= figures("constant", AdapterValues(constant), constant.size, material.source)
+def alternatives(
+    material: Material, adapter: Adapter, constant_steps: int, kept: Path
+) -> dict[str, tuple[Values, int]]:
+    """The fit and what it is compared with, each with its number of parameters."""
+    found: dict[str, tuple[Values, int]] = {
+        "3x32 fit": (AdapterValues(adapter), network.parameters(adapter.layers))
+    }
     if material.nbrdf is not None:
-        row |= figures("nbrdf", material.nbrdf, WEIGHTS, material.source)
-    return row
-
-
-def figures(label: str, model: Values, parameters: int, source: Values) -> dict[str, Any]:
-    """A model's figures against the source in each range of directions, its size, and its time per pair."""
-    found: dict[str, Any] = {f"{label} parameters": parameters, f"{label} ns": round(nanoseconds(model), 1)}
-    for words, cosines in RANGES.items():
-        pairs = Pairs.draw(seed=2, cosines=cosines)
-        found |= {f"{label} {k}{words}": round(v, 6) for k, v in compare(model, source, pairs).items()}
+        found["NBRDF"] = material.nbrdf, WEIGHTS
+    if material.source.isotropic:
+        path = kept / f"{slug(material)}_constant_{constant_steps}.safetensors"
+        if not path.exists():
+            recipe = replace(CONSTANT, steps=constant_steps)
+            fit_constant(tabulate_values(material.source), recipe).adapter.save(path)
+        constant = Adapter.load(path)
+        found["constant Principled"] = AdapterValues(constant), constant.size
     return found
 
 
-def nanoseconds(model: Values, repetitions: int = 5) -> float:
-    """Best time of a pair of directions among many at once, on all cores, compilation apart."""
+def judged(material: Material, models: dict[str, tuple[Values, int]]) -> list[dict[str, Any]]:
+    """Figures of each model against the material in each range of directions, its size, and its time per pair, all
+    models in turns."""
+    times = nanoseconds([model for model, _ in models.values()])
+    rows = []
+    for (name, (model, parameters)), ns in zip(models.items(), times, strict=True):
+        row: dict[str, Any] = {"model": name, "parameters": parameters, "ns": round(ns, 1)}
+        for words, cosines in RANGES.items():
+            pairs = Pairs.draw(seed=2, cosines=cosines)
+            row |= {f"{k}{words}": round(v, 6) for k, v in compare(model, material.source, pairs).items()}
+        rows.append(row)
+    return rows
+
+
+def slug(material: Material) -> str:
+    return material.name.replace(" ", "-")
+
+
+def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
+    """Best time of a pair of directions among many at once, on all cores, the models in turns, compilation apart."""
     rng = np.random.default_rng(0)
     lanes = [dr.auto.Float(rng.random(TIMED_PAIRS).astype(np.float32)) for _ in range(4)]
 
-    def direction(mu: Any, turn: Any) -> nma.ops.Vec3:
+    def direction(mu: Any, turn: Any) -> Vec3:
         sin = dr.sqrt(1.0 - mu * mu)
-        return nma.ops.Vec3(sin * dr.cos(6.2831853 * turn), sin * dr.sin(6.2831853 * turn), mu)
+        return Vec3(sin * dr.cos(6.2831853 * turn), sin * dr.sin(6.2831853 * turn), mu)
 
     wi, wo = direction(*lanes[:2]), direction(*lanes[2:])
     dr.eval(wi, wo)
-    times = []
+    times: list[list[float]] = [[] for _ in models]
     for _ in range(repetitions + 1):
-        began = time.perf_counter()
-        value = model.eval(wi, wo)
-        dr.eval(value)
-        dr.sync_thread()
-        times.append(time.perf_counter() - began)
-    return min(times[1:]) / TIMED_PAIRS * 1e9
+        for model, spent in zip(models, times, strict=True):
+            began = time.perf_counter()
+            value = model.eval(wi, wo)
+            dr.eval(value)
+            dr.sync_thread()
+            spent.append(time.perf_counter() - began)
+    return [min(spent[1:]) / TIMED_PAIRS * 1e9 for spent in times]
 
 
 def rendered(
     material: Material, adapter: Adapter, kept: Path, arguments: argparse.Namespace
 ) -> tuple[list[Any], dict[str, float]]:
     """The material, its fit and the map of their FLIP; and the FLIP of the fit, and of noise alone."""
-    path = kept / "rendered.safetensors"
+    path = kept / f"{slug(material)}_rendered.safetensors"
     adapter.save(path)
-    bsdfs = (material.bsdf, material.bsdf, {"type": "nma", "adapter": str(path)})
-    reference, again, own = (
-        studio.render(bsdf, arguments.size, arguments.spp, seed, SAMPLER)
-        for seed, bsdf in enumerate(bsdfs, 1)
-    )
+    images = []
+    for label, seed, bsdf in (
+        ("itself", 1, material.bsdf),
+        ("again", 2, material.bsdf),
+        (f"fit_{adapter.training['steps']}", 3, {"type": "nma", "adapter": str(path)}),
+    ):
+        file = kept / f"{slug(material)}_{label}_{arguments.size}_{arguments.spp}.npy"
+        if not file.exists():
+            common.save_array(file, studio.render(bsdf, arguments.size, arguments.spp, seed, SAMPLER))
+        images.append(np.load(file))
+    reference, again, own = images
     errors, noise = (nma.compare_images(image, reference) for image in (own, again))
     found = {key: round(errors[key], 5) for key in ("flip_ldr", "flip_hdr")}
     found |= {f"noise_{key}": round(noise[key], 5) for key in ("flip_ldr", "flip_hdr")}
@@ -217,17 +239,15 @@ def flip_picture(errors: np.ndarray) -> np.ndarray:
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The tables of README.md."""
-    models = {"fit": "3x32 fit", "nbrdf": "NBRDF", "constant": "constant Principled"}
-    head = "| material | model | log loss | AE | SMAPE | log loss from .05 | parameters | ns a pair |"
-    lines = [head, "|---|---|---|---|---|---|---|---|"]
+    lines = ["| material | model | log loss | AE | SMAPE | log loss from .05 | parameters | ns a pair |"]
+    lines += ["|---|---|---|---|---|---|---|---|"]
     for row in rows:
-        for label, words in models.items():
-            if f"{label} ns" in row:
-                values = [f"{row[f'{label} {key}']:.4f}" for key in ("log_loss", "ae")]
-                values += [f"{row[f'{label} smape']:.3f}", f"{row[f'{label} log_loss from .05']:.4f}"]
-                values += [f"{row[f'{label} parameters']:,}", f"{row[f'{label} ns']:.1f}"]
-                lines.append(f"| {row['name']} | {words} | {' | '.join(values)} |")
-    lines += means([row for row in rows if "nbrdf ns" in row])
+        for m in row["models"]:
+            figures = f"{m['log_loss']:.4f} | {m['ae']:.4f} | {m['smape']:.3f} | {m['log_loss from .05']:.4f}"
+            lines.append(
+                f"| {row['name']} | {m['model']} | {figures} | {m['parameters']:,} | {m['ns']:.1f} |"
+            )
+    lines += means([row for row in rows if any(m["model"] == "NBRDF" for m in row["models"])])
     lines += ["", "| material | seconds of the fit | FLIP | HDR-FLIP | FLIP of noise | HDR-FLIP of noise |"]
     lines += ["|---|---|---|---|---|---|"]
     keys = ("flip_ldr", "flip_hdr", "noise_flip_ldr", "noise_flip_hdr")
@@ -239,15 +259,17 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def means(rows: list[dict[str, Any]]) -> list[str]:
-    """Mean log losses of what NBRDF has, too."""
+    """Mean log losses over the materials that have an NBRDF network, too."""
     if not rows:
         return []
-    lines = ["", f"Mean log loss of the {len(rows)} that have NBRDF networks:", ""]
-    for words, name in (("", "over [.02, 1]"), (" from .05", "over [.05, 1]")):
-        fit, nbrdf = (
-            np.mean([row[f"{label} log_loss{words}"] for row in rows]) for label in ("fit", "nbrdf")
-        )
-        lines.append(f"- {name}: fit {fit:.5f}, NBRDF {nbrdf:.5f}")
+    lines = [
+        "",
+        f"| mean of the {len(rows)} with NBRDF networks | log loss | log loss from .05 |",
+        "|---|---|---|",
+    ]
+    for k, model in enumerate(rows[0]["models"]):
+        found = [np.mean([row["models"][k][f"log_loss{words}"] for row in rows]) for words in RANGES]
+        lines.append(f"| {model['model']} | " + " | ".join(f"{loss:.5f}" for loss in found) + " |")
     return lines
 
 
