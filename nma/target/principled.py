@@ -179,13 +179,17 @@ def diffuse_terms(p: Principled, g: Geometry) -> Terms:
 
 
 def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms:
-    """Fresnel reflectance of metal, tinted and plain dielectric together. `cos2` is cos^2, which a caller may know before
-    the root that is `cos`; `weight` is `schlick_weight(cos)`."""
+    """Fresnel reflectance of metal, tinted and plain dielectric together.
+
+    `cos2` is cos^2, which a caller may know before the root that is `cos`; `weight` is `schlick_weight(cos)`.
+    """
     tinted = (1.0 - p.metallic) * p.spec_tint
     plain = (1.0 - p.metallic) - tinted
     # Schlick's F0 + (1 - F0) weight for both coloured parts, collected.
     f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
-    white = plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight
+    white = (
+        plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight
+    )
     return Terms(f0 * (1.0 - weight), white)
 
 

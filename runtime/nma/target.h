@@ -254,8 +254,7 @@ inline Terms<T> diffuse_terms(const Principled<T>& p, const Geometry<T>& g) {
     return Terms<T>{colored + tinted * luminance_inverse<T>(p.base_color), sheen - tinted};
 }
 
-// Fresnel reflectance of metal, tinted and plain dielectric together. `cos2` is cos^2, which a caller may know
-// before the root that is `cos`; `weight` is `schlick_weight(cos)`.
+// Fresnel reflectance of metal, tinted and plain dielectric together.
 template <class T>
 inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     const auto tinted = (T(1.0) - p.metallic) * p.spec_tint;
