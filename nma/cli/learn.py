@@ -235,7 +235,7 @@ def _compare(adapter, source) -> None:
 
     figures = compare(AdapterValues(adapter), source)
     listed = ", ".join(f"{name} {value:.5f}" for name, value in figures.items())
-    console.err.print(f"against {source.name} at {PAIRS:,} pairs of directions: {listed}")
+    console.err.print(f"against {source.name} at {PAIRS:,} pairs of directions: {listed}", soft_wrap=True)
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:

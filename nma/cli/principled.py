@@ -76,7 +76,7 @@ def principled(
         _write(
             output, principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
         )
-    console.err.print(f"wrote {output}", highlight=False)
+    console.err.print(f"wrote {output}", highlight=False, soft_wrap=True)
 
 
 def _json(description: dict[str, Any]) -> str:
