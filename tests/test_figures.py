@@ -1,6 +1,7 @@
 """Every experiment of `figures/` runs in its quick form and leaves its results: a new one is tested on arrival."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,17 @@ EXPERIMENTS = sorted(script.parent.name for script in (ROOT / "figures").glob("*
 
 def figures(*words):
     command = [sys.executable, str(ROOT / "figures"), *words]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=600, check=False)
+    # Quick forms train for a few steps: compiling takes longest.
+    fast = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=600,
+        check=False,
+        env={**os.environ, "XLA_FLAGS": fast},
+    )
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
