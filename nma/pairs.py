@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import metrics
-from nma.jit import dr
-from nma.ops import Vec3
-from nma.sources.base import Values
+from nma.sources.base import Values, direction
 
 PAIRS = 20_000
 COSINES = (0.02, 1.0)
@@ -39,7 +37,7 @@ class Pairs:
 
     def values(self, source: Values) -> NDArray[np.float64]:
         """f cos(theta_o) [1/sr] of a source, (n, 3)."""
-        value = source.eval(_direction(self.mu_i, self.phi_i), _direction(self.mu_o, self.phi_o))
+        value = source.eval(direction(self.mu_i, self.phi_i), direction(self.mu_o, self.phi_o))
         return np.stack([np.broadcast_to(c.numpy(), len(self.mu_i)) for c in value], axis=-1).astype(
             np.float64
         )
@@ -49,8 +47,3 @@ def compare(model: Values, reference: Values, pairs: Pairs | None = None) -> dic
     """Log loss, AE and SMAPE of f cos(theta_o) (`nma.metrics`), means over pairs and RGB."""
     pairs = pairs or Pairs.draw()
     return metrics.value_metrics(pairs.values(model), pairs.values(reference))
-
-
-def _direction(mu: NDArray, phi: NDArray) -> Vec3:
-    sin = np.sqrt(1.0 - mu * mu)
-    return Vec3(*(dr.auto.Float(x.astype(np.float32)) for x in (sin * np.cos(phi), sin * np.sin(phi), mu)))

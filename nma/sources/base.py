@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from nma import ops
 from nma.jit import dr
 from nma.ops import Color, Float, Mask, Vec3
@@ -79,6 +82,12 @@ class Values(Protocol):
         it neither branches on values nor reads them.
         """
         ...
+
+
+def direction(mu: NDArray, phi: NDArray) -> Vec3:
+    """Unit directions, one per Dr.Jit lane, from their cosines and azimuths."""
+    sin = np.sqrt(1.0 - mu * mu)
+    return Vec3(*(dr.auto.Float(x.astype(np.float32)) for x in (sin * np.cos(phi), sin * np.sin(phi), mu)))
 
 
 def throughput(walk: Walk) -> Color:

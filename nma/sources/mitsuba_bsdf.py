@@ -17,6 +17,7 @@ from nma.errors import ParamError, SourceError, one_line
 from nma.jit import dr
 from nma.ops import Color, Vec3
 from nma.sources import rgl
+from nma.sources.base import direction
 
 # Pairs of directions that tell whether a BSDF is isotropic, and the relative change that rounding explains.
 _PAIRS = 512
@@ -69,7 +70,7 @@ class MitsubaBsdf:
         rng = np.random.default_rng(0)
         mu_i, mu_o = rng.uniform(0.05, 0.95, (2, _PAIRS))
         phi_i, phi_o, turn = rng.uniform(0.0, 2.0 * np.pi, (3, _PAIRS))
-        sets = [self.eval(_direction(mu_i, phi_i + a), _direction(mu_o, phi_o + a)) for a in (0.0, turn)]
+        sets = [self.eval(direction(mu_i, phi_i + a), direction(mu_o, phi_o + a)) for a in (0.0, turn)]
         one, other = (np.stack([c.numpy() for c in value]) for value in sets)
         return bool(np.abs(one - other).sum() <= _ROUNDING * np.abs(one).sum())
 
@@ -173,9 +174,3 @@ def _interaction(mi: Any, wi: Any, uv: tuple[float, float]) -> Any:
     si.sh_frame = mi.Frame3f(mi.Normal3f(0.0, 0.0, 1.0))
     si.dp_du, si.dp_dv = mi.Vector3f(1.0, 0.0, 0.0), mi.Vector3f(0.0, 1.0, 0.0)
     return si
-
-
-def _direction(mu: Any, phi: Any) -> Vec3:
-    """Lanes of unit directions from cosines and azimuths."""
-    sin = np.sqrt(1.0 - mu * mu)
-    return Vec3(*(dr.auto.Float(x.astype(np.float32)) for x in (sin * np.cos(phi), sin * np.sin(phi), mu)))

@@ -15,8 +15,7 @@ import nma
 from nma import target
 from nma.adapter import Adapter
 from nma.errors import TableError
-from nma.evaluate import evaluate, tabulate_adapter
-from nma.metrics import table_metrics
+from nma.evaluate import evaluate, table_log_loss
 from nma.ops import Color
 from nma.params import SPACES
 from nma.table import ISOTROPIC, Tables
@@ -100,7 +99,10 @@ def fit_constant(
         start: _adapter(tables, raw, {**record, "start": start})
         for start, raw in zip(_STARTS, loop.result(run, recipe), strict=True)
     }
-    judged = {start: _rough_log_loss(adapter, tables) for start, adapter in fits.items()}
+    judged = {
+        start: table_log_loss(adapter, tables.params[0], tables.values[0], _DIRECTIONS)
+        for start, adapter in fits.items()
+    }
     adapter = fits[min(judged, key=lambda start: judged[start])]
     figures = evaluate(adapter, tables).mean
     adapter.training.update({"log_loss": figures["log_loss"], "log_loss_of_starts": judged})
@@ -130,12 +132,6 @@ def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -
     space = next(s for s in SPACES.values() if s.size == size)
     layers = [(np.zeros((len(raw), 1), np.float32), np.asarray(raw, np.float32))]
     return Adapter(space, "direction", layers, 1, False, CONSTANT_PARAMS, record)
-
-
-def _rough_log_loss(adapter: Adapter, tables: Tables) -> float:
-    """The log loss over the whole table, from fewer points than `evaluate` takes."""
-    mean = tabulate_adapter(adapter, tables.params, directions=_DIRECTIONS)
-    return table_metrics(mean[0], tables.values[0], np.zeros_like(mean[0]))["log_loss"]
 
 
 def _plain(adapter: Adapter) -> Principled:

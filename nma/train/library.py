@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import TableError
-from nma.evaluate import tabulate_adapter
+from nma.evaluate import table_log_loss
 from nma.library import Library
-from nma.metrics import table_metrics
 from nma.params import CODE_BOUND, LIBRARY
 from nma.table import ISOTROPIC, Tables
 from nma.train import loop
@@ -131,7 +130,7 @@ def encode(
     # The nearest code may already be the best.
     found = np.concatenate([found, library.codes[near[:1]]])
     best = found[np.argmin(_judge(found, library, tables, recipe))]
-    log_losses = [_log_loss(library, code, tables) for code in (best, library.codes[near[0]])]
+    log_losses = [table_log_loss(adapter, code, tables.values[0]) for code in (best, library.codes[near[0]])]
     return Encoded(best, log_losses[0], library.names[near[0]], log_losses[1])
 
 
@@ -187,9 +186,3 @@ def _sampled_log_loss(code: jax.Array, layers: Any, batches: Batch, recipe: Reci
         return distance(bin_means(blend_of(layers, batch, recipe), batch, recipe), batch, recipe)[1]
 
     return jax.lax.map(of_batch, batches).mean()
-
-
-def _log_loss(library: Library, code: NDArray, tables: Tables) -> float:
-    """The log loss over all bins."""
-    own = tabulate_adapter(library.adapter, code[None])[0]
-    return table_metrics(own, tables.values[0], np.zeros_like(own))["log_loss"]
