@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,23 @@ def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) 
         raise ImageError(f"{path}: cannot write an array of shape {array.shape} as an image")
     kind = mi.Bitmap.PixelFormat.MultiChannel if channels else None
     bitmap = mi.Bitmap(array, kind, list(channels))
-    return _write_atomically(path, lambda temporary: bitmap.write(str(temporary)))
+    with second_thread():
+        return _write_atomically(path, lambda temporary: bitmap.write(str(temporary)))
+
+
+@contextmanager
+def second_thread() -> Iterator[None]:
+    """Where the process has one core, lends Mitsuba a thread: its EXR files wait for a second one, else forever."""
+    import drjit as dr
+
+    if dr.thread_count() > 1:
+        yield
+        return
+    dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(1)
 
 
 def read_image(path: str | Path) -> NDArray[np.float32]:
@@ -107,7 +124,8 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
     if not Path(path).is_file():
         raise ImageError(f"image {path} does not exist")
     try:
-        bitmap = mi.Bitmap(str(path))
+        with second_thread():
+            bitmap = mi.Bitmap(str(path))
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = _colours(bitmap)
         return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))

@@ -1,5 +1,6 @@
 """Image files, tone mapping, metrics, difference pictures and contact sheets."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -128,6 +129,18 @@ def test_exr_keeps_values(tmp_path: Path, picture):
     np.testing.assert_array_equal(
         read_image(write_exr(tmp_path / "new" / "a.exr", picture * 100.0)), picture * 100.0
     )
+
+
+def test_exr_on_one_core(tmp_path: Path):
+    """In a process of its own, which would hang where OpenEXR finds no second thread."""
+    program = (
+        "import drjit, sys; drjit.set_thread_count(1)\n"
+        "from nma.image_io import read_image, write_exr\n"
+        "print(read_image(write_exr(sys.argv[1], [[[1.0, 2.0, 3.0]]])).tolist(), drjit.thread_count())"
+    )
+    words = [sys.executable, "-c", program, str(tmp_path / "one.exr")]
+    run = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
+    assert run.stdout == "[[[1.0, 2.0, 3.0]]] 1\n"
 
 
 def test_png_holds_the_tonemapped_picture(tmp_path: Path, picture):
