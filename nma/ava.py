@@ -8,6 +8,7 @@ unbiased.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,24 @@ def hashed(number: Any, seed: Any) -> Float:
     state = (number ^ (seed * 0x9E3779B9)) * 747796405 + 2891336453
     word = ((state >> ((state >> 28) + 4)) ^ state) * 277803737
     return dr.auto.Float(((word >> 22) ^ word) >> 8) * (1.0 / 2**24)
+
+
+def points(
+    place: Sequence[Float], u: Sequence[Float], grid: Grid = ISOTROPIC, finest: float | None = FINEST
+) -> Points:
+    """The point `u` of the unit cube, placed in the bin `place`, (theta_i, phi_i, theta_o, phi_o).
+
+    Isotropic grids take three numbers `u` and ignore phi_i, others four. Points crowd down to lobes of width `finest`;
+    without one they spread uniformly.
+    """
+    i, a, o, b = place
+    if grid.phi_i:
+        if finest is None:
+            return uniform_anisotropic_bin_points(i, a, o, b, tuple(u), grid)
+        return anisotropic_bin_points(i, a, o, b, tuple(u), grid, finest)
+    if finest is None:
+        return uniform_bin_points(i, o, b, tuple(u), grid)
+    return bin_points(i, o, b, tuple(u), grid, finest)
 
 
 def bin_points(

@@ -7,7 +7,6 @@ knows a value for each bin.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -144,7 +143,7 @@ def _moments(
     def body(k: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
         u = [ava.shifted(dr.gather(Float, x, k >> 1), s) for x, s in zip(lattice, shifts, strict=True)]
         u = [dr.select((k & 1) == 0, x, 1.0 - x) * (1.0 - 2.0 * _EDGE) + _EDGE for x in u]
-        wi, wo, w = _points(place, u, grid, crowded)
+        wi, wo, w = ava.points(place, u, grid, ava.FINEST if crowded else None)
         if not grid.phi_i:
             # A folded bin is both of its mirror halves: every other pair of points goes to the other one.
             wo = Vec3(wo.x, dr.select((k & 2) == 0, wo.y, -wo.y), wo.z)
@@ -155,17 +154,6 @@ def _moments(
     state = (dr.zeros(UInt32, len(bins)), [zero] * 8)
     _, sums = dr.while_loop(state, lambda k, sums: k < last, body, mode="symbolic", label="bin means")
     return np.stack([s.numpy() for s in sums], axis=-1).astype(np.float64) / count
-
-
-def _points(place: Sequence[Float], u: Sequence[Float], grid: Grid, crowded: bool) -> ava.Points:
-    """One point in each bin."""
-    i, a, o, b = place
-    if grid.phi_i:
-        four = (u[0], u[1], u[2], u[3])
-        law = ava.anisotropic_bin_points if crowded else ava.uniform_anisotropic_bin_points
-        return law(i, a, o, b, four, grid)
-    three = (u[0], u[1], u[2])
-    return (ava.bin_points if crowded else ava.uniform_bin_points)(i, o, b, three, grid)
 
 
 def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:

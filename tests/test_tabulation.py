@@ -250,12 +250,11 @@ FOUR = np.array(
 def test_points_of_anisotropic_bins_have_no_preference(crowded):
     """Moments of all four angles: weights have mean 1, and the azimuths go round the right way."""
     grid = Grid(6, 8, 12, phi_i=10)
-    law = ava.anisotropic_bin_points if crowded else ava.uniform_anisotropic_bin_points
     bins = np.minimum(FOUR, [5, 9, 7, 11])
     i, a, o, b = bins.T
     shift = np.random.default_rng(8).random((4, 1, 16, len(bins)))
     u = (ava.lattice(2048, 4).T.reshape(4, 2048, 1, 1) + shift) % 1.0
-    points = law(i, a, o, b, tuple(u), grid)
+    points = ava.points((i, a, o, b), u, grid, ava.FINEST if crowded else None)
     mu_i, mu_o, phi_i, phi_o = (i + 0.5) / 6, (o + 0.5) / 8, (a + 0.5) * math.pi / 5, (b + 0.5) * math.pi / 6
     at_i, at_o = ((np.arctan2(w.y, w.x) % (2 * math.pi)) for w in (points.wi, points.wo))
     for k, (found, middle, half) in enumerate(((at_i, phi_i, math.pi / 10), (at_o, phi_o, math.pi / 12))):

@@ -51,29 +51,13 @@ def view(batch: Any) -> Vec3:
 
 def _points(batch: Batch, recipe: Recipe) -> ava.Points:
     """Points (points, bins_per_row, rows) of every bin."""
-    if len(batch.shift) == 4:
-        return _anisotropic_points(batch, recipe)
     if recipe.points_law == "centre":
-        middle = (0.5 + 0.0 * batch.shift)[:, None]
-        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(middle), recipe.grid)
-    lattice = jnp.asarray(ava.lattice(recipe.points), jnp.float32).T[:, :, None, None]
-    u = (lattice + batch.shift[:, None]) % 1.0
-    if recipe.points_law == "uniform":
-        return ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(u), recipe.grid)
-    return ava.bin_points(batch.i, batch.o, batch.p, tuple(u), recipe.grid, recipe.finest)
-
-
-def _anisotropic_points(batch: Batch, recipe: Recipe) -> ava.Points:
-    place = (batch.i, batch.a, batch.o, batch.p)
-    grid = recipe.grid
-    if recipe.points_law == "centre":
-        middle = (0.5 + 0.0 * batch.shift)[:, None]
-        return ava.uniform_anisotropic_bin_points(*place, tuple(middle), grid)
-    lattice = jnp.asarray(ava.lattice(recipe.points, 4), jnp.float32).T[:, :, None, None]
-    u = tuple((lattice + batch.shift[:, None]) % 1.0)
-    if recipe.points_law == "uniform":
-        return ava.uniform_anisotropic_bin_points(*place, u, grid)
-    return ava.anisotropic_bin_points(*place, u, grid, recipe.finest)
+        u: Any = (0.5 + 0.0 * batch.shift)[:, None]
+    else:
+        lattice = jnp.asarray(ava.lattice(recipe.points, len(batch.shift)), jnp.float32)
+        u = (lattice.T[:, :, None, None] + batch.shift[:, None]) % 1.0
+    finest = recipe.finest if recipe.points_law == "crowded" else None
+    return ava.points((batch.i, batch.a, batch.o, batch.p), tuple(u), recipe.grid, finest)
 
 
 def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
