@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-import nma
 from nma import target
 from nma.adapter import Adapter
 from nma.errors import TableError
@@ -24,6 +21,7 @@ from nma.train import loop
 from nma.train.data import Batch, BinSampler, Pool, draw
 from nma.train.loss import blend_loss
 from nma.train.recipe import Recipe
+from nma.train.run import record_of
 
 # The paper's 11 numbers and the fake subsurface. `anisotropic` stays 0: tables of isotropic materials do not know it.
 CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
@@ -94,7 +92,7 @@ def fit_constant(
     loop.train(
         recipe, run, lambda step: draw(pool, sampler, recipe, step), objective=_objective, progress=progress
     )
-    record = {**(record or {}), **_record(tables, recipe, run)}
+    record = {**(record or {}), "params": tables.params[0].tolist(), **record_of(recipe, run)}
     fits = {
         start: _adapter(tables, raw, {**record, "start": start})
         for start, raw in zip(_STARTS, loop.result(run, recipe), strict=True)
@@ -139,15 +137,3 @@ def _plain(adapter: Adapter) -> Principled:
     flat = adapter.numbers(np.zeros((1, adapter.space.size)), [0.5])[0, 0].tolist()
     (p,) = target.from_numbers(flat, CONSTANT_PARAMS).instances
     return p
-
-
-def _record(tables: Tables, recipe: Recipe, run: loop.Run) -> dict[str, Any]:
-    return {
-        "params": tables.params[0].tolist(),
-        "recipe": asdict(recipe),
-        "steps": run.step,
-        "seconds": round(run.seconds, 1),
-        "version": nma.__version__,
-        "jax": jax.__version__,
-        "date": time.strftime("%Y-%m-%d"),
-    }

@@ -104,16 +104,11 @@ def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[st
     tail = run.log_losses[-1000:]
     training = {
         **record,
-        "recipe": asdict(recipe),
-        "steps": run.step,
+        **record_of(recipe, run),
         "bins_seen": run.step * recipe.bins_per_step,
-        "seconds": round(run.seconds, 1),
         "log_loss_of_last_1000_steps": float(np.mean(tail)) if tail else None,
-        "version": nma.__version__,
-        "jax": jax.__version__,
         "device": jax.devices()[0].device_kind,
         "machine": platform.machine(),
-        "date": time.strftime("%Y-%m-%d"),
     }
     return Adapter(
         space,
@@ -125,3 +120,15 @@ def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[st
         training,
         recipe.bounds_energy,
     )
+
+
+def record_of(recipe: Recipe, run: loop.Run) -> dict[str, Any]:
+    """What the record of every run says."""
+    return {
+        "recipe": asdict(recipe),
+        "steps": run.step,
+        "seconds": round(run.seconds, 1),
+        "version": nma.__version__,
+        "jax": jax.__version__,
+        "date": time.strftime("%Y-%m-%d"),
+    }
