@@ -1,15 +1,8 @@
-"""The C++ runtime against the package that it repeats: the target, the network, and files that make no sense."""
+"""The C++ runtime against the package that it repeats: the target, the network, samples, curves."""
 
 import ctypes
-import importlib.util
-import json
-import re
-import struct
 import subprocess
-import sys
-import textwrap
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -18,10 +11,7 @@ from target_cases import random_blend, random_directions, stacked
 
 import nma
 from nma import encoding, network, target
-from nma.errors import WeightsError
-from nma.export.classes import classes
-from nma.export.cpp import cpp, print_function
-from nma.export.functions import Unsupported, parsed
+from nma.adapter import weights_file
 from nma.ops import Vec3
 from nma.params import MEASURED
 from nma.runtime import INSTRUCTION_SETS, Runtime, available
@@ -31,7 +21,6 @@ FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
 CASES = 4000
 # Numbers of an instance.
 FIELDS = len(target.Principled._fields) + 2
-
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -294,49 +283,9 @@ def test_an_instruction_set_that_this_cpu_lacks_falls_back():
     assert message.value == b"no such instruction set"
 
 
-def stored(name):
-    return (ROOT / "nma/adapters" / f"{name}.safetensors").read_bytes()
-
-
-def changed(name, **fields):
-    """A weights file whose metadata differ."""
-    data = stored(name)
-    size = struct.unpack("<Q", data[:8])[0]
-    header = json.loads(data[8 : 8 + size])
-    about = json.loads(header["__metadata__"]["nma"]) | fields
-    header["__metadata__"]["nma"] = json.dumps(about)
-    text = json.dumps(header).encode()
-    return struct.pack("<Q", len(text)) + text + data[8 + size :]
-
-
-@pytest.mark.parametrize(
-    "data, message",
-    [
-        (b"", "too short"),
-        (stored("layered3-3x32")[:1000], "truncated"),
-        (stored("layered3-3x32")[:-4], "does not lie within the file"),
-        (b"\xff" * 100, "truncated"),
-        (struct.pack("<Q", 2) + b"{}", "__metadata__"),
-        (struct.pack("<Q", 3) + b'{"a', "open string"),
-        (struct.pack("<Q", 60) + b"[" * 60, "nested too deep"),
-        (changed("layered3-3x32", format=2), "format"),
-        (changed("layered3-3x32", encoding="new"), "unknown input encoding 'new'"),
-        (changed("layered3-3x32", dialect="cycles"), "dialect 'cycles'"),
-        (changed("layered3-3x32", instances=1), "does not fit its description"),
-        (changed("layered3-3x32", hidden=[32, 32, 31]), "hidden layers"),
-        (changed("layered3-3x32", hidden="many"), "'hidden'"),
-        (changed("layered3-3x32", target=[]), "does not fit its description"),
-    ],
-)
-def test_files_that_make_no_sense_are_refused(tmp_path, data, message):
-    path = tmp_path / "bad.safetensors"
-    path.write_bytes(data)
-    with pytest.raises(WeightsError, match=re.escape(f"{path}: ") + ".*" + re.escape(message)):
-        Runtime(path)
-
-
 def test_an_adapter_in_memory_is_the_one_of_its_file():
-    loaded, data, (params, cosines) = Runtime("layered3-3x32"), stored("layered3-3x32"), queries(15)
+    loaded, data = Runtime("layered3-3x32"), weights_file("layered3-3x32").read_bytes()
+    params, cosines = queries(15)
     library = loaded._library
     library.nma_from_memory.restype = ctypes.c_void_p
     handle = ctypes.c_void_p(library.nma_from_memory(data, ctypes.c_size_t(len(data)), 0, None, 0))
@@ -344,29 +293,3 @@ def test_an_adapter_in_memory_is_the_one_of_its_file():
     library.nma_outputs_many(handle, CASES, *(pointer(x) for x in (params, cosines, found)))
     library.nma_free(handle)
     np.testing.assert_array_equal(found, loaded.outputs(params, cosines))
-
-
-def test_the_generated_headers_are_those_of_the_present_package():
-    assert (ROOT / "runtime/nma/target.h").read_text() == cpp(), "run `python -m nma.export`"
-    assert (ROOT / "runtime/nma/classes.h").read_text() == classes(), "run `python -m nma.export`"
-
-
-def module_of(text, path: Path) -> ModuleType:
-    path.write_text(textwrap.dedent(text))
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_constructs_beyond_the_subset_are_refused_with_their_place(tmp_path, monkeypatch):
-    text = """
-    def broken(x: float) -> float:
-        y = x + 1.0
-        return y if x > 0 else x
-    """
-    path = tmp_path / "broken.py"
-    module = module_of(text, path)
-    monkeypatch.setitem(sys.modules, "broken", module)
-    with pytest.raises(Unsupported, match=r"broken\.py:4: `y if x > 0 else x` cannot be exported"):
-        print_function(parsed(module.broken))
