@@ -14,8 +14,7 @@ from scipy.stats import norm
 pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_type=ImportError)
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
 
-
-from test_training import FALSE_ALARM, TINY, batch_of, lambertian
+from training_cases import FALSE_ALARM, TINY, batch_of, lambertian
 
 from nma.dataset import Settings, simulate_block
 from nma.table import ISOTROPIC, Grid
