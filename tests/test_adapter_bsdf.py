@@ -7,9 +7,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from adapter_cases import VARIANTS, random_adapter
 from safetensors import safe_open
 from safetensors.numpy import save
-from test_weights import VARIANTS, random_adapter
 
 import nma.render
 from nma import target

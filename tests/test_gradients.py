@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_weights import random_adapter
+from adapter_cases import random_adapter
 
 import nma.render
 from nma.jit import dr

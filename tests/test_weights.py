@@ -1,4 +1,4 @@
-"""Networks, encodings, weights files and adapters: what is written comes back, what is wrong is said in one line."""
+"""Weights files: what is written comes back, what is wrong is said in one line."""
 
 import json
 import re
@@ -8,38 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from adapter_cases import VARIANTS, materials, random_adapter
 from safetensors import safe_open
 from safetensors.numpy import save
 
 from nma import adapter as adapters
-from nma import encoding, network, target
+from nma import target
 from nma.adapter import Adapter
-from nma.errors import NmaError, WeightsError
-from nma.jit import dr
+from nma.errors import WeightsError
 from nma.params import LAYERED3
-from nma.target import PRINCIPLED_PARAMS
-
-VARIANTS = {"single": (1, False), "blended": (2, False), "omega_i": (1, True), "blended + omega_i": (2, True)}
-
-
-def random_adapter(
-    instances=2, directional=True, name="layered3", hidden="3x32", seed=0, params=PRINCIPLED_PARAMS
-):
-    """An adapter that was not trained, with outputs that vary over the class."""
-    rng = np.random.default_rng(seed)
-    sizes = [
-        encoding.size(name, LAYERED3, directional),
-        *network.hidden(hidden),
-        target.output_size(instances, params),
-    ]
-    layers = [(m, 0.3 * rng.standard_normal(b.shape).astype(np.float32)) for m, b in network.init(rng, sizes)]
-    layers[-1] = (10.0 * layers[-1][0], layers[-1][1])
-    record = {"data": "none", "seed": seed}
-    return Adapter(LAYERED3, name, layers, instances, directional, params, record)
-
-
-def materials(n, seed=1):
-    return LAYERED3.sample(np.random.default_rng(seed), n)
 
 
 @pytest.fixture
@@ -242,155 +219,6 @@ def test_other_precisions_are_read_as_single(path):
     metadata, tensors = parts(path)
     path.write_bytes(save({k: v.astype(np.float64) for k, v in tensors.items()}, metadata=metadata))
     assert Adapter.load(path).layers[0][0].dtype == np.float32
-
-
-def test_the_paper_s_network_has_7159_parameters():
-    """A library of 100 learnt embeddings of 32 numbers; 33 inputs (with cos theta_i) to 3x32 to 23 outputs."""
-    assert target.output_size(2) == 23
-    layers = network.init(np.random.default_rng(0), [33, *network.hidden("3x32"), target.output_size(2)])
-    assert network.parameters(layers) + 100 * 32 == 7159
-
-
-def test_networks_are_named_by_depth_and_width():
-    assert network.hidden("5x64") == [64] * 5
-    for name in ("64", "x64", "5x", "0x64", "5x0", "5x-3", "axb", ""):
-        with pytest.raises(NmaError, match="DEPTHxWIDTH"):
-            network.hidden(name)
-
-
-def test_a_network_is_its_matrices():
-    """Against the sum written out: ReLU between the layers, none after the last."""
-    rng = np.random.default_rng(3)
-    layers = [
-        (rng.standard_normal((4, 3)), rng.standard_normal(4)),
-        (rng.standard_normal((2, 4)), -np.ones(2)),
-    ]
-    x = rng.standard_normal((5, 3))
-    (w0, b0), (w1, b1) = layers
-    expected = np.array([w1 @ np.maximum(w0 @ row + b0, 0.0) + b1 for row in x])
-    np.testing.assert_allclose(network.forward(layers, x), expected)
-    assert (expected < 0).any()
-    inputs = [dr.auto.Float(c.astype(np.float32)) for c in x.T]
-    for active in (True, dr.arange(dr.auto.UInt32, 5) < 3):
-        lanes = network.forward_lanes(layers, inputs, active)
-        dr.eval(lanes)
-        found = np.stack([lane.numpy() for lane in lanes], axis=-1)
-        known = slice(None) if active is True else slice(3)
-        np.testing.assert_allclose(found[known], expected[known], rtol=1e-5, atol=1e-5)
-    nowhere = network.forward_lanes(layers, inputs, dr.auto.Bool(False) & (inputs[0] > 0.0))
-    assert not any(lane.numpy().any() for lane in nowhere)
-
-
-def test_initial_layers_have_the_spread_of_their_law():
-    """He 2015: outputs as large as inputs; the output's bias as asked for; the same seed, the same layers."""
-    layers = network.init(np.random.default_rng(0), [200, 300, 100], np.arange(100))
-    assert layers[0][0].std() == pytest.approx(np.sqrt(2.0 / 200), rel=0.02)
-    assert layers[1][0].std() == pytest.approx(0.1 * np.sqrt(2.0 / 300), rel=0.02)
-    np.testing.assert_array_equal(layers[1][1], np.arange(100))
-    again = network.init(np.random.default_rng(0), [200, 300, 100], np.arange(100))
-    np.testing.assert_array_equal(again[0][0], layers[0][0])
-    deep = network.init(np.random.default_rng(1), [14, 64, 64, 64, 64, 64, 23])
-    x = np.random.default_rng(2).uniform(-1.0, 1.0, (100, 14))
-    spread = network.forward(deep, x).std()
-    assert 0.01 < spread < 1.0
-
-
-@pytest.mark.parametrize("name", ("raw", "layered3"))
-def test_encodings_are_about_unit_sized_and_finite(name):
-    columns = list(materials(2000).T)
-    for mu in (0.0, 1e-6, 0.3, 1.0):
-        inputs = encoding.get(name)(columns, np.full(2000, mu))
-        stacked = np.stack(np.broadcast_arrays(*inputs), axis=-1)
-        assert np.isfinite(stacked).all()
-        assert stacked.shape[1] == encoding.size(name, LAYERED3, True)
-        if name == "layered3":
-            assert np.abs(stacked).max() <= 1.0 + 1e-6
-    assert encoding.size("raw", LAYERED3, True) == 14
-    assert encoding.size("raw", LAYERED3, False) == 13
-
-
-def test_the_raw_encoding_is_the_paper_s_input():
-    columns = [float(k) for k in range(13)]
-    assert encoding.raw(columns, 0.25) == [*columns, 0.25]
-    assert encoding.raw(columns, None) == columns
-
-
-def test_encodings_agree_on_all_libraries():
-    """The same numbers from plain floats, NumPy and Dr.Jit."""
-    params, mu = materials(50), np.linspace(0.0, 1.0, 50)
-    on_numpy = np.stack(np.broadcast_arrays(*encoding.layered3(list(params.T), mu)), axis=-1)
-    columns = [dr.auto.Float(c.astype(np.float32)) for c in params.T]
-    on_drjit = encoding.layered3(columns, dr.auto.Float(mu.astype(np.float32)))
-    dr.eval(on_drjit)
-    np.testing.assert_allclose(np.stack([x.numpy() for x in on_drjit], axis=-1), on_numpy, atol=2e-5)
-    plain = encoding.layered3(params[7].tolist(), float(mu[7]))
-    assert all(type(x) is float for x in plain)
-    np.testing.assert_allclose(plain, on_numpy[7], rtol=1e-12)
-
-
-def test_an_unknown_encoding_is_refused():
-    with pytest.raises(WeightsError, match="unknown input encoding 'fourier'; this version knows raw"):
-        encoding.get("fourier")
-
-
-def flat(blend):
-    """The numbers of a blend as an array (lanes, size)."""
-    numbers = target.numbers(blend)
-    dr.eval(numbers)
-    lanes = [np.asarray(x.numpy() if dr.is_array_v(x) else x, np.float64) for x in numbers]
-    return np.stack(np.broadcast_arrays(*lanes), axis=-1)
-
-
-@pytest.mark.parametrize("name", ("raw", "layered3", "direction"))
-@pytest.mark.parametrize("form", VARIANTS.values(), ids=VARIANTS)
-def test_prepare_agrees_on_numpy_and_dr_jit(form, name):
-    adapter = random_adapter(*form, name=name, hidden="2x8")
-    params, mu = materials(64), np.random.default_rng(5).random(64)
-    on_numpy = flat(adapter.prepare(list(params.T), mu))
-    columns = [dr.auto.Float(c.astype(np.float32)) for c in params.T]
-    on_drjit = flat(adapter.prepare(columns, dr.auto.Float(mu.astype(np.float32))))
-    assert np.isfinite(on_numpy).all()
-    shape = (64, adapter.size)
-    np.testing.assert_allclose(np.broadcast_to(on_drjit, shape), np.broadcast_to(on_numpy, shape), atol=2e-5)
-
-
-@pytest.mark.parametrize("name", ("raw", "layered3", "direction"))
-@pytest.mark.parametrize("form", VARIANTS.values(), ids=VARIANTS)
-def test_only_directional_adapters_depend_on_the_direction(form, name):
-    adapter = random_adapter(*form, name=name)
-    curves = adapter.numbers(materials(4), np.linspace(0.0, 1.0, 7))
-    assert curves.shape == (4, 7, adapter.size)
-    assert curves.dtype == np.float32
-    varies = np.ptp(curves, axis=1).max() > 1e-3
-    assert varies == adapter.directional
-    if not adapter.directional:
-        # Rounding alone: a product of matrices may sum the last rows in another order than the first.
-        assert np.ptp(curves, axis=1).max() < 1e-6
-    assert (np.ptp(curves, axis=0).max() > 1e-3) == (name != "direction")
-
-
-def test_curves_are_the_prepared_numbers():
-    """`numbers` for each material and cosine is what `prepare` says there."""
-    adapter, params, mu = random_adapter(), materials(3), np.array([0.0, 0.4, 1.0])
-    curves = adapter.numbers(params, mu)
-    for m in range(3):
-        for k in range(3):
-            single = flat(adapter.prepare([np.array([c]) for c in params[m]], mu[k : k + 1]))
-            np.testing.assert_allclose(curves[m, k], single[0], atol=1e-6)
-
-
-def test_decoded_numbers_lie_in_their_ranges():
-    """However wild the network."""
-    wild = random_adapter()
-    wild = replace(wild, layers=[(100.0 * m, 100.0 * b) for m, b in wild.layers])
-    curves = wild.numbers(materials(50), np.linspace(0.0, 1.0, 5))
-    ranges = [p for p in PRINCIPLED_PARAMS for _ in range(p.size)] * 2
-    assert np.isfinite(curves).all()
-    for k, p in enumerate(ranges):
-        assert curves[..., k].min() >= p.low * (1 - 1e-5)
-        assert curves[..., k].max() <= p.high * (1 + 1e-5)
-    assert curves[..., -1].min() >= 0.0
-    assert curves[..., -1].max() <= 1.0
 
 
 def test_every_shipped_adapter_loads_and_works():
