@@ -1,6 +1,7 @@
 """Plugins compiled for Mitsuba's scalar renderer against the vectorised ones, in processes of their own."""
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 import nma
 from nma import encoding, native, network
 from nma.errors import MissingDependencyError
+from nma.image_io import write_exr
 
 MATERIAL = {
     "alpha_top": 0.08,
@@ -24,8 +26,9 @@ MATERIAL = {
     "albedo": {"type": "rgb", "value": [0.9, 0.3, 0.2]},
     "sigma_t": 0.5,
 }
+CHECKS = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.2, 0.1]}, "color1": 0.3}
 TEXTURED = MATERIAL | {
-    "albedo": {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.2, 0.1]}, "color1": 0.3},
+    "albedo": CHECKS,
     "alpha_bottom": {"type": "checkerboard", "color0": 0.1, "color1": 0.4},
 }
 # A ball under a bright sky and a lamp, seen so that all of the picture is the ball.
@@ -104,10 +107,11 @@ def test_scalar_and_vectorised_plugins_render_the_same():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"sigma_t": 7.0}, "sigma_t is 7.0"),
+        ({"sigma_t": 7.0}, "sigma_t is 7, allowed is 0 .. 1, the range"),
         ({"precision": "half"}, "precision is float32, compact or bfloat16, not 'half'"),
         ({"adapter": "none"}, "none: no such weights file"),
         ({"albedo": None}, "no value for albedo"),
+        ({"material": "wet-nickel"}, "`material` is known in vectorised variants only"),
     ],
 )
 def test_bad_inputs_are_refused_with_their_name(change, message):
@@ -115,6 +119,30 @@ def test_bad_inputs_are_refused_with_their_name(change, message):
     done = run("scalar_rgb", 1, bsdf)
     assert done.returncode != 0
     assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    "pixel, extra, message",
+    [
+        (
+            7.0,
+            {},
+            "the texture of sigma_t holds 7 at x=1, y=2, one of 3 such values of 36; allowed is 0 .. 1",
+        ),
+        (math.nan, {"clamp": True}, "the texture of sigma_t holds nan at x=1, y=2"),
+        ([0.1, 0.2, 0.3], {}, "the texture of sigma_t is coloured"),
+        (0.5, {"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo holds 1.5 at x=0, y=0"),
+        (7.0, {"clamp": True}, None),
+        (-1.0, {"type": "layered"}, "the texture of sigma_t holds -1 at x=1, y=2, one of 3"),
+        (7.0, {"type": "layered"}, None),
+    ],
+)
+def test_textures_are_checked_when_they_are_loaded(tmp_path, pixel, extra, message):
+    image = np.ones((4, 3, 3))
+    image[2, 1] = pixel
+    texture = {"type": "bitmap", "filename": str(write_exr(tmp_path / "t.exr", image)), "raw": True}
+    done = run("scalar_rgb", 1, {"type": "nma", **MATERIAL, "sigma_t": texture, **extra})
+    assert message in done.stderr if message else done.returncode == 0
 
 
 def test_the_executable_renders_a_scene(cache, tmp_path):

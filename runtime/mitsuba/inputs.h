@@ -6,8 +6,12 @@
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/texture.h>
 
+#include <algorithm>
+#include <cmath>
+
 #include "nma/math.h"
 #include "nma/weights.h"
+#include "texels.h"
 
 namespace mitsuba::nma_plugin {
 
@@ -31,13 +35,16 @@ class Inputs {
 public:
     MI_IMPORT_TYPES(Texture)
 
-    // Ranges are those of the parameters; with `clamp`, what lies beyond is moved there instead of refused. Textures are
-    // only seen while rendering and always moved.
-    Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool clamp) {
+    // Ranges are those of the parameters: what the material means, or with `trained` what the adapter was trained on. There the
+    // property `clamp` moves what lies beyond instead of refusing it. What a texture only knows while rendering (mesh
+    // attributes) is moved always.
+    Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained) : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
+        if (props.has_property("material"))
+            Throw("`material` is known in vectorised variants only; give the parameters (`nma materials NAME` shows them, nma.render.load.material_bsdf makes them)");
         for (const SourceParam& p : parameters) {
             Input input{p, nullptr, {0.0f, 0.0f, 0.0f}};
             if (!props.has_property(p.name)) Throw("no value for %s; give it a number, a colour or a texture", p.name);
-            read(props, input, clamp);
+            read(props, input);
             textured_ |= input.texture != nullptr;
             inputs_.push_back(input);
         }
@@ -83,7 +90,7 @@ private:
     static float low(const SourceParam& p) { return static_cast<float>(p.low); }
     static float high(const SourceParam& p) { return static_cast<float>(p.high); }
 
-    void read(const Properties& props, Input& input, bool clamp) {
+    void read(const Properties& props, Input& input) {
         using Type = Properties::Type;
         const SourceParam& p = input.param;
         const Type type = props.type(p.name);
@@ -93,23 +100,46 @@ private:
             input.value = props.get<Colour>(p.name);
         } else {
             input.texture = props.get_unbounded_texture<Texture>(p.name);
-            if (input.texture->is_spatially_varying()) return;
+            if (input.texture->is_spatially_varying()) return check(p, *input.texture);
             const SurfaceInteraction3f nowhere = dr::zeros<SurfaceInteraction3f>();
             input.value = Colour(input.texture->eval(nowhere));
             input.texture = nullptr;
         }
-        const float slack = 1e-6f * nma::maximum(nma::absolute(low(p)), 1.0f);
         for (int c = 0; c < p.size; ++c) {
             Float& x = input.value[c];
-            const bool inside = x >= low(p) - slack && x <= high(p) + slack;
-            if (!std::isfinite(x) || !(clamp || inside))
-                Throw("%s is %f, allowed is %f .. %f, the range that the adapter was trained on; set `clamp` to move it there", p.name, x, low(p), high(p));
+            if (!allowed(p, x)) Throw("%s is %g, %s", p.name, x, range(p));
             x = nma::clip(static_cast<float>(x), low(p), high(p));
         }
     }
 
+    // Refuses textures that hold what is not allowed, or colours where a single number is wanted.
+    void check(const SourceParam& p, Texture& texture) const {
+        for (const Texels& texels : TexelFinder<Float>(texture).found) {
+            const auto& numbers = texels.numbers;
+            const auto bad = [&](float x) { return !allowed(p, x); };
+            if (const auto first = std::find_if(numbers.begin(), numbers.end(), bad); first != numbers.end()) {
+                const std::size_t pixel = static_cast<std::size_t>(first - numbers.begin()) / texels.channels;
+                Throw("the texture of %s holds %g at x=%zu, y=%zu, one of %zu such values of %zu; %s", p.name, *first, pixel % texels.width, pixel / texels.width,
+                      static_cast<std::size_t>(std::count_if(numbers.begin(), numbers.end(), bad)), numbers.size(), range(p));
+            }
+            for (std::size_t k = 0; p.size == 1 && k < numbers.size(); ++k)
+                if (nma::absolute(numbers[k] - numbers[k - k % texels.channels]) > 1e-6f)
+                    Throw("the texture of %s is coloured; a grey one is wanted, for one number per pixel", p.name);
+        }
+    }
+
+    bool allowed(const SourceParam& p, float x) const {
+        const float slack = 1e-6f * nma::maximum(nma::absolute(low(p)), 1.0f);
+        return std::isfinite(x) && (clamp_ || (x >= low(p) - slack && x <= high(p) + slack));
+    }
+
+    std::string range(const SourceParam& p) const {
+        const char* hint = trained_ ? ", the range that the adapter was trained on; set `clamp` to move it there" : "";
+        return tfm::format("allowed is %g .. %g%s", p.low, p.high, hint);
+    }
+
     std::vector<Input> inputs_;
-    bool textured_ = false;
+    bool trained_, clamp_, textured_ = false;
 };
 
 // Registers a plugin for `scalar_rgb` alone: other variants have the Python BSDF of the same name.

@@ -19,7 +19,7 @@ public:
 
     explicit NmaBSDF(const Properties& props)
         : Base(props), name_(props.get<std::string_view>("adapter", "layered3-5x64")), adapter_(load(name_, props.get<std::string_view>("precision", "float32"))),
-          inputs_(props, adapter_.parameters(), props.get<bool>("clamp", false)) {
+          inputs_(props, adapter_.parameters(), true) {
         const bool online = props.get<bool>("online", false);
         m_flags = inputs_.flags();
         m_components.push_back(m_flags);

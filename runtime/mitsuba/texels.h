@@ -1,0 +1,70 @@
+// The numbers that a texture is made of, as far as they are known before anything is rendered.
+#pragma once
+
+#include <drjit/tensor.h>
+#include <mitsuba/core/object.h>
+#include <mitsuba/core/spectrum.h>
+
+#include <cmath>
+#include <utility>
+#include <vector>
+
+namespace mitsuba::nma_plugin {
+
+// Rows of `width` pixels of `channels` numbers; single numbers and colours are one pixel.
+struct Texels {
+    std::vector<float> numbers;
+    std::size_t width = 1, channels = 1;
+};
+
+// Finds all arrays, numbers and colours that a texture and those inside it show as `data` and `value`.
+template <class Float>
+class TexelFinder final : public TraversalCallback {
+public:
+    explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
+
+    std::vector<Texels> found;
+
+protected:
+    void put_object(std::string_view, Object* object, uint32_t) override {
+        if (!object) return;
+        Object* const outer = std::exchange(shown_, object);
+        object->traverse(this);
+        shown_ = outer;
+    }
+
+    void put_value(std::string_view name, void* value, uint32_t, const std::type_info& type) override {
+        if (name == "data" && !(pixels<float>(value, type) || pixels<dr::half>(value, type) || pixels<uint8_t>(value, type)))
+            Throw("a texture keeps its pixels as %s, which this plugin does not read", type.name());
+        if (name != "value") return;
+        if (type == typeid(Float)) found.push_back({{static_cast<float>(*static_cast<Float*>(value))}, 1, 1});
+        if (type == typeid(Color<Float, 3>)) {
+            const auto& c = *static_cast<Color<Float, 3>*>(value);
+            found.push_back({{static_cast<float>(c.x()), static_cast<float>(c.y()), static_cast<float>(c.z())}, 1, 3});
+        }
+    }
+
+private:
+    // Of an array (height, width, channels) of numbers of type T.
+    template <class T>
+    bool pixels(void* value, const std::type_info& type) {
+        using Tensor = dr::Tensor<dr::DynamicArray<T>>;
+        if (type != typeid(Tensor)) return false;
+        const auto& tensor = *static_cast<Tensor*>(value);
+        Texels texels{{}, tensor.ndim() > 1 ? tensor.shape(1) : 1, tensor.ndim() > 2 ? tensor.shape(2) : 1};
+        // Mitsuba decodes bytes when it looks them up, from sRGB unless the texture is `raw`.
+        const bool srgb = std::is_same_v<T, uint8_t> && shown_->to_string().find("raw = 1") == std::string::npos;
+        for (std::size_t k = 0; k < tensor.size(); ++k) {
+            float x = static_cast<float>(tensor.array().entry(k));
+            if (std::is_same_v<T, uint8_t>) x /= 255.0f;
+            if (srgb) x = x <= 0.04045f ? x / 12.92f : std::pow((x + 0.055f) / 1.055f, 2.4f);
+            texels.numbers.push_back(x);
+        }
+        found.push_back(std::move(texels));
+        return true;
+    }
+
+    Object* shown_ = nullptr;
+};
+
+}  // namespace mitsuba::nma_plugin
