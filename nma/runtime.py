@@ -92,7 +92,7 @@ class Runtime:
         return found[:, :3], found[:, 3:6], found[:, 6]
 
     def _many(self, name: str, params: ArrayLike, cos_theta_i: ArrayLike, width: int) -> Array:
-        rows, cosines = _rows("params", params, self.parameters), _rows("cos_theta_i", cos_theta_i, 0)
+        rows, cosines = _rows("params", params, self.parameters), _rows("cos_theta_i", cos_theta_i)
         if len(rows) != len(cosines):
             raise ParamError(f"{len(rows)} rows of params for {len(cosines)} cosines")
         found = np.empty((len(rows), width), np.float32)
@@ -109,11 +109,12 @@ class Runtime:
         return found
 
 
-def _rows(name: str, values: ArrayLike, width: int) -> Array:
-    """Contiguous float32, (n, width), or (n,) for width 0."""
+def _rows(name: str, values: ArrayLike, *row: int) -> Array:
+    """Contiguous float32: rows of this shape."""
     array = np.ascontiguousarray(values, np.float32)
-    if array.shape[1:] != ((width,) if width else ()) or array.ndim != (2 if width else 1):
-        raise ParamError(f"{name} wants shape {f'(n, {width})' if width else '(n,)'}, got {array.shape}")
+    if array.ndim == 0 or array.shape[1:] != row:
+        wanted = "(n,)" if not row else f"(n, {row[0]})"
+        raise ParamError(f"{name} wants shape {wanted}, got {array.shape}")
     return array if array.ctypes.data % _ALIGNMENT == 0 else array.copy()
 
 

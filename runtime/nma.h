@@ -113,8 +113,9 @@ public:
             for (int q = 0; q < now; ++q) {
                 Material& made = materials[first + q];
                 made.in_plane_ = in_plane_;
-                kernels().finish(recipe_, outputs + q * network_.output_stride(), cos_theta_i[first + q], made.blend_);
+                kernels().decode(recipe_, outputs + q * network_.output_stride(), cos_theta_i[first + q], made.blend_);
             }
+            for (int q = first; q < first + now; ++q) kernels().odds(recipe_, cos_theta_i[q], materials[q].blend_);
         }
     }
 

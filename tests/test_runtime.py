@@ -189,7 +189,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
     for instruction_set in in_single_precision():
         loaded = Runtime(tmp_path / "single.safetensors", instruction_set)
         assert loaded.parameters == 0
-        found = np.column_stack(loaded.eval(loaded.prepare(np.zeros(CASES), wi.T[2]), wi, wo))
+        found = np.column_stack(loaded.eval(loaded.prepare(np.zeros((CASES, 0)), wi.T[2]), wi, wo))
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 

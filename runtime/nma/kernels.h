@@ -88,26 +88,28 @@ struct Kernels {
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
     // Many: rows of `inputs` padded likewise, rows of the last layer's width in `outputs`.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs, int output_stride);
-    // What comes before the network and after it, `raw` aligned to 64 bytes.
+    // What comes before the network and after it, `raw` aligned to 64 bytes. CPUs that run their widest vectors on fewer units
+    // run `odds`, whose vectors are narrow, at half its speed among them: batches keep the two apart.
     void (*encode)(const Recipe&, const float* parameters, float cosine, float* inputs);
-    void (*finish)(const Recipe&, float* raw, float cosine, Blend<float>&);
-    // All three for one query.
+    void (*decode)(const Recipe&, float* raw, float cosine, Blend<float>&);
+    void (*odds)(const Recipe&, float cosine, Blend<float>&);
+    // All of it for one query.
     void (*prepare)(const Recipe&, const float* parameters, float cosine, Blend<float>&);
 };
 
 // Those of `set`; the portable ones if it cannot run here.
 inline const Kernels& kernels(InstructionSet set) {
-    static constexpr Kernels PORTABLE{InstructionSet::portable, portable::forward, portable::forward_many, portable::encode, portable::finish, portable::prepare<portable::forward>};
+    static constexpr Kernels PORTABLE{InstructionSet::portable, portable::forward, portable::forward_many, portable::encode, portable::decode, portable::odds, portable::prepare<portable::forward>};
     if (!supported(set)) return PORTABLE;
 #if defined(NMA_X86)
-    static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::encode, avx2::finish, avx2::prepare<avx2::forward>};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many, avx512::encode, avx512::finish, avx512::prepare_either};
-    static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::encode, avx512::finish, avx512::prepare<avx512_bf16::forward>};
+    static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::encode, avx2::decode, avx2::odds, avx2::prepare<avx2::forward>};
+    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many, avx512::encode, avx512::decode, avx512::odds, avx512::prepare_either};
+    static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::encode, avx512::decode, avx512::odds, avx512::prepare<avx512_bf16::forward>};
     if (set == InstructionSet::avx2) return AVX2;
     if (set == InstructionSet::avx512) return AVX512;
     if (set == InstructionSet::avx512_bf16) return BF16;
 #elif defined(NMA_ARM)
-    static constexpr Kernels NEON{InstructionSet::neon, neon::forward, neon::forward_many, neon::encode, neon::finish, neon::prepare<neon::forward>};
+    static constexpr Kernels NEON{InstructionSet::neon, neon::forward, neon::forward_many, neon::encode, neon::decode, neon::odds, neon::prepare<neon::forward>};
     if (set == InstructionSet::neon) return NEON;
 #endif
     return PORTABLE;

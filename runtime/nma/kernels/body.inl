@@ -103,17 +103,19 @@ NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameter
     recipe.encoding.encode(parameters, cosine, inputs, recipe.network.layers[0].in);
 }
 
-NMA_FN NMA_WHOLE inline void finish(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
+// The blend of a network's outputs, but for its odds; those of a blend.
+NMA_FN NMA_WHOLE inline void decode(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
     for (int k = 0; k < recipe.ranges.count; k += LANES) store(raw + k, decoded(recipe.ranges, k, load(raw + k), 1.0f - cosine * cosine));
     if (recipe.ranges.count <= Few::MOST) assemble(recipe, raw, Few(raw), blend);
     else assemble(recipe, raw, Indexed(raw), blend);
-    weigh(blend, cosine, recipe.bounded);
 }
+NMA_FN NMA_WHOLE inline void odds(const Recipe& recipe, float cosine, Blend<float>& blend) { weigh(blend, cosine, recipe.bounded); }
 
 template <void (*FORWARD)(const NetworkView&, const float*, float*)>
 NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
     alignas(64) float inputs[WIDEST_LAYER], numbers[WIDEST_LAYER];
     encode(recipe, parameters, cosine, inputs);
     FORWARD(recipe.network, inputs, numbers);
-    finish(recipe, numbers, cosine, blend);
+    decode(recipe, numbers, cosine, blend);
+    odds(recipe, cosine, blend);
 }
