@@ -112,7 +112,7 @@ class Runtime:
 def _rows(name: str, values: ArrayLike, *row: int) -> Array:
     """Contiguous float32: rows of this shape."""
     array = np.ascontiguousarray(values, np.float32)
-    if array.ndim == 0 or array.shape[1:] != row:
+    if array.shape[1:] != row:
         wanted = "(n,)" if not row else f"(n, {row[0]})"
         raise ParamError(f"{name} wants shape {wanted}, got {array.shape}")
     return array if array.ctypes.data % _ALIGNMENT == 0 else array.copy()

@@ -6,7 +6,7 @@ follow CONVENTIONS.md: local frame, z up, `wi` towards the viewer, `wo` towards 
 Deliberate differences from Mitsuba's plugin, all of them small:
 - Peaks of narrow lobes keep their digits: GGX and GTR1 are written with the components of the half vector, never with
   1 + (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is off by several per cent at alpha .001.
-- `specular` may vary like every other number, and 0 means no dielectric reflection (Mitsuba replaces 0 by .001).
+- `specular` may vary like every other number, and 0 means no dielectric reflection (Mitsuba drops that of metals, too).
 - The cosine between a direction and the half vector is |wi + wo| / 2, the same for both directions. Mitsuba takes the
   dot product of `wi`, which rounding spoils where the directions are nearly opposite: both grazing, forward.
 - Tints divide by max(luminance, 1e-6), so they fade for colours darker than that instead of switching to white at zero.
