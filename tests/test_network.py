@@ -27,12 +27,14 @@ def test_networks_are_named_by_depth_and_width():
             network.hidden(name)
 
 
-def test_a_network_is_its_matrices():
-    """Against the sum written out: ReLU between the layers, none after the last."""
+@pytest.mark.parametrize("blocks", (False, True))
+def test_a_network_is_its_matrices(blocks, monkeypatch):
+    """Against the sum written out: ReLU between the layers, none after the last. A layer has more than one block."""
+    monkeypatch.setattr(network, "_many_registers", lambda value: blocks)
     rng = np.random.default_rng(3)
     layers = [
-        (rng.standard_normal((4, 3)), rng.standard_normal(4)),
-        (rng.standard_normal((2, 4)), -np.ones(2)),
+        (rng.standard_normal((30, 3)), rng.standard_normal(30)),
+        (rng.standard_normal((2, 30)), -np.ones(2)),
     ]
     x = rng.standard_normal((5, 3))
     (w0, b0), (w1, b1) = layers
