@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -124,10 +125,9 @@ def _many_registers(value: Float) -> bool:
     """Whether kernels for this array have the 32 vector registers of AVX-512."""
     import drjit as dr
 
-    try:
-        from numpy._core import _multiarray_umath as core
-    except ImportError:  # NumPy 1
-        from numpy.core import _multiarray_umath as core  # type: ignore[no-redef]
+    core: Any = (
+        sys.modules.get("numpy._core._multiarray_umath") or sys.modules["numpy.core._multiarray_umath"]
+    )
     features: dict[str, bool] = core.__cpu_features__
     return dr.backend_v(value) == dr.JitBackend.LLVM and features.get("AVX512F", False)
 
