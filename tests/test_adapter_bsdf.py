@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 import nma.render
-from nma import target
+from nma import network, target
 from nma.adapter import Adapter, shipped
 from nma.jit import dr
 from nma.ops import Vec3
@@ -241,6 +242,26 @@ def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
         off = np.abs(network - other) > 0.01 * network
         assert off.mean() < 0.01
         assert abs(network.mean() - other.mean()) < 2e-3 * network.mean()
+
+
+def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
+    """In the kernel of a path tracer, which asks for a value and for a sample each time its loop is recorded."""
+    calls = []
+
+    def counted(function, *arguments):
+        calls.append(function.__name__)
+        return function(*arguments)
+
+    for module, name in ((network, "forward_lanes"), (target, "eval_pdf"), (target, "sample")):
+        monkeypatch.setattr(module, name, partial(counted, getattr(module, name)))
+    dr.eval(mi.render(scene(textured(weights)), spp=1))
+    assert calls.count("forward_lanes") == calls.count("eval_pdf") == calls.count("sample") > 0
+    # Elsewhere nothing is kept.
+    bsdf, (si, rng) = mi.load_dict(textured(weights)), interactions(10)
+    calls.clear()
+    bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(0.0, 0.6, 0.8))
+    bsdf.sample(mi.BSDFContext(), si, *drawn(rng))
+    assert calls.count("forward_lanes") == 2
 
 
 def test_edits_show_at_once(weights):

@@ -11,7 +11,7 @@ range are moved there instead of refused; and the parameters of the adapter's cl
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from nma import target
 from nma.adapter import Adapter, shipped
@@ -42,6 +42,9 @@ def define() -> type:
             self.adapter = Adapter.load(found)
             self.inputs = Inputs(self.adapter.space, props, "training", props.get("clamp", False))
             self._curves = self._make_curves()
+            self._last: Any = None
+            self._attached = mi.Float(0.0)  # has a gradient wherever gradients are not suspended
+            dr.enable_grad(self._attached)
             self._warned = False
             flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             if self.adapter.anisotropic:
@@ -57,6 +60,7 @@ def define() -> type:
         def parameters_changed(self, keys: Any = ()) -> None:
             self.inputs.check(keys)
             self._curves = self._make_curves()
+            self._last = None
 
         def to_string(self) -> str:
             return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
@@ -90,14 +94,29 @@ def define() -> type:
         def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
             """The blend at `si`, and the lanes that see the front."""
             self._warn_of_light_paths(ctx)
-            active = mi.Bool(active) & (si.wi.z > 0)
-            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-                active = mi.Bool(False)
+            active = mi.Bool(active if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) else False)
+            front = active & (si.wi.z > 0)
             cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
             if self._curves is not None:
-                return self._curves.at(cos_theta_i, active), active
-            columns, tangent = self.inputs.columns(si, active), (si.wi.x, si.wi.y)
-            return self.adapter.prepare(columns, cos_theta_i, active, tangent), active
+                return self._curves.at(cos_theta_i, front), front
+            return self._by_network(si, cos_theta_i, active, front), front
+
+        def _by_network(self, si, cos_theta_i, active, front) -> Blend:
+            """The blend at `si`.
+
+            Of one point Mitsuba asks for the value and then for a sample, even where one call could give both: it does
+            not call `eval_pdf_sample` of Python BSDFs. The second takes what the first left in the same recording.
+            """
+            seen = mi.SurfaceInteraction3f(si), active
+            key = dr.grad_enabled(self._attached), *dr.detail.collect_indices(seen)
+            last, self._last = self._last, None
+            if last is not None and last.key == key:
+                return last.blend
+            columns, tangent = self.inputs.columns(si, front), (si.wi.x, si.wi.y)
+            blend = self.adapter.prepare(columns, cos_theta_i, front, tangent)
+            if si.wi.z.state == dr.VarState.Symbolic:
+                self._last = _Prepared(key, seen, blend)
+            return blend
 
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""
@@ -130,6 +149,14 @@ def define() -> type:
         return bs, (mi.Color3f(*value) / dr.select(valid, pdf, 1.0)) & valid
 
     return Nma
+
+
+class _Prepared(NamedTuple):
+    """A blend, what it was prepared for, and the names of that: no other variables bear them while these are kept."""
+
+    key: tuple[int, ...]
+    seen: Any
+    blend: Blend
 
 
 def _vec3(v: Any) -> Vec3:
