@@ -1,13 +1,14 @@
 // Neural Material Adapter: expensive materials rendered as blends of Principled BRDFs that a tiny network prepares.
 //
 //     const nma::Adapter adapter = nma::Adapter::load("layered3-5x64.safetensors");
-//     const nma::Material at_hit = adapter.prepare(parameters, cos_theta_i);     // once per shading point
+//     const nma::Material at_hit = adapter.prepare(parameters, wi);              // once per shading point
 //     const nma::Value v = at_hit.eval(wi, wo);                                  // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = at_hit.sample(wi, u_lobe, u1, u2);
 //
-// C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading allocates and throws `nma::Error`; everything else does neither and is safe to call
-// from many threads at once. Directions are unit vectors in the local frame, z up, `wi` towards the viewer, `wo` towards
-// the light. Lobes of adapters with `in_plane` parameters are stretched along the plane of incidence, which is found here.
+// C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading and making
+// `Curves` allocate and throw `nma::Error`; everything else does neither and is safe to call from many threads at once.
+// Directions are unit vectors in the local frame, z up, `wi` towards the viewer, `wo` towards the light. Lobes of adapters
+// with `in_plane` parameters are stretched along the plane of incidence, which is found here.
 #pragma once
 
 #include <cstddef>
@@ -22,7 +23,7 @@ using Direction = Vec3<float>;
 using Value = Evaluation<float>;
 using Sampled = Sample<float>;
 
-// The material at one shading point, for the cos(theta_i) it was prepared for.
+// The material at one shading point, for the cos(theta_i), of anisotropic adapters the `wi`, that it was prepared for.
 class Material {
 public:
     // f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both 0 below the horizon.
@@ -96,45 +97,59 @@ public:
     int output_count() const { return recipe_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
-    // The blend for the parameters of the source material at cos(theta_i).
-    Material prepare(const float* parameters, float cos_theta_i) const {
+    // Whether the view's azimuth matters; where it does not, of `wi` only wi.z does. A cosine c in place of `wi` stands for
+    // the azimuth 0: wi = (sqrt(1 - c^2), 0, c).
+    bool anisotropic() const { return recipe_.encoding.anisotropic(); }
+
+    // The blend for the parameters of the source material, seen from `wi`.
+    Material prepare(const float* parameters, const Direction& wi) const {
         Material made;
         made.in_plane_ = in_plane_;
-        kernels().prepare(recipe_, parameters, cos_theta_i, made.blend_);
+        kernels().prepare(recipe_, parameters, wi, made.blend_);
         return made;
     }
+    Material prepare(const float* parameters, float cos_theta_i) const { return prepare(parameters, at_azimuth_0(cos_theta_i)); }
 
     // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
-    void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
+    void prepare_many(int count, const float* parameters, const Direction* wi, Material* materials) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
-            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count(), cos_theta_i + first, outputs);
+            outputs_of_block(now, row(parameters, first), wi + first, outputs);
             for (int q = 0; q < now; ++q) {
                 Material& made = materials[first + q];
                 made.in_plane_ = in_plane_;
-                kernels().decode(recipe_, outputs + q * network_.output_stride(), cos_theta_i[first + q], made.blend_);
+                kernels().decode(recipe_, outputs + q * network_.output_stride(), wi[first + q].z, made.blend_);
             }
-            for (int q = first; q < first + now; ++q) kernels().odds(recipe_, cos_theta_i[q], materials[q].blend_);
+            for (int q = first; q < first + now; ++q) kernels().odds(recipe_, wi[q].z, materials[q].blend_);
         }
+    }
+    void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
+        in_blocks(count, cos_theta_i, [&](int first, int now, const Direction* wi) { prepare_many(now, row(parameters, first), wi, materials + first); });
     }
 
     // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
-    void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
+    void network_outputs(const float* parameters, const Direction& wi, float* raw) const {
         alignas(64) float inputs[WIDEST_LAYER];
-        kernels().encode(recipe_, parameters, cos_theta_i, inputs);
+        kernels().encode(recipe_, parameters, wi, inputs);
         network_.forward(inputs, raw);
     }
+    void network_outputs(const float* parameters, float cos_theta_i, float* raw) const { network_outputs(parameters, at_azimuth_0(cos_theta_i), raw); }
 
     // Likewise for many, rows of `output_count` numbers.
-    void network_outputs_many(int count, const float* parameters, const float* cos_theta_i, float* raw) const {
+    void network_outputs_many(int count, const float* parameters, const Direction* wi, float* raw) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
-            outputs_of_block(now, parameters + static_cast<std::size_t>(first) * parameter_count(), cos_theta_i + first, outputs);
+            outputs_of_block(now, row(parameters, first), wi + first, outputs);
             for (int q = 0; q < now; ++q)
                 std::copy_n(outputs + q * network_.output_stride(), output_count(), raw + static_cast<std::size_t>(first + q) * output_count());
         }
+    }
+    void network_outputs_many(int count, const float* parameters, const float* cos_theta_i, float* raw) const {
+        in_blocks(count, cos_theta_i, [&](int first, int now, const Direction* wi) {
+            network_outputs_many(now, row(parameters, first), wi, raw + static_cast<std::size_t>(first) * output_count());
+        });
     }
 
 private:
@@ -177,6 +192,8 @@ private:
 
     // Refuses a network that does not fit its own description, or this version's target.
     void check() const {
+        if (anisotropic() && (in_plane_ || !weights_.directional))
+            throw Error("an anisotropic adapter whose target holds in the plane of incidence, or ignores the direction; train again");
         if (weights_.dialect != DIALECT) throw Error("written for the Principled dialect '" + weights_.dialect + "', not '" + DIALECT + "'");
         if (weights_.instances > MAX_INSTANCES) throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
         if (weights_.layers.front().in != recipe_.encoding.size() || weights_.layers.back().out != output_count())
@@ -209,9 +226,26 @@ private:
         recipe_.lanes = lanes_.data();
     }
 
-    void outputs_of_block(int count, const float* parameters, const float* cos_theta_i, float* outputs) const {
+    // Isotropic adapters do not look at what would cost them a root.
+    Direction at_azimuth_0(float cos_theta_i) const { return {anisotropic() ? safe_sqrt(1.0f - cos_theta_i * cos_theta_i) : 0.0f, 0.0f, cos_theta_i}; }
+
+    // Calls `work(first, count, wi)` for blocks of queries, whose first is the number `first` of all.
+    template <class Work>
+    void in_blocks(int count, const float* cos_theta_i, const Work& work) const {
+        Direction wi[BLOCK];
+        for (int first = 0; first < count; first += BLOCK) {
+            const int now = std::min(BLOCK, count - first);
+            std::transform(cos_theta_i + first, cos_theta_i + first + now, wi, [&](float cosine) { return at_azimuth_0(cosine); });
+            work(first, now, wi);
+        }
+    }
+
+    // The parameters of query `q`.
+    const float* row(const float* parameters, int q) const { return parameters + static_cast<std::size_t>(q) * parameter_count(); }
+
+    void outputs_of_block(int count, const float* parameters, const Direction* wi, float* outputs) const {
         alignas(64) float inputs[BLOCK * WIDEST_LAYER];
-        for (int q = 0; q < count; ++q) kernels().encode(recipe_, parameters + q * parameter_count(), cos_theta_i[q], inputs + q * network_.input_stride());
+        for (int q = 0; q < count; ++q) kernels().encode(recipe_, row(parameters, q), wi[q], inputs + q * network_.input_stride());
         network_.forward_many(count, inputs, outputs);
     }
 
@@ -223,13 +257,16 @@ private:
     bool in_plane_ = false;
 };
 
-// The blends of an untextured material over cos(theta_i), interpolated between nodes: no network at the shading point.
+// The blends of an untextured material over cos(theta_i), interpolated between nodes: no network at the shading point. Of
+// isotropic adapters only.
 class Curves {
 public:
     // As many as nma/render/curves.py has.
     static constexpr int NODES = 128;
 
+    // Throws `Error` for anisotropic adapters.
     Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
+        if (adapter.anisotropic()) throw Error("an anisotropic adapter, whose materials depend on the view's azimuth: there are no curves over cos(theta_i); prepare by direction");
         for (int n = 0; n < std::max(nodes, 2); ++n) {
             const float cosine = static_cast<float>(n) / static_cast<float>(std::max(nodes, 2) - 1);
             nodes_.push_back(adapter.prepare(parameters, maximum(cosine, 1e-4f)));

@@ -22,6 +22,31 @@ void put(nma_material* to, const nma::Material& material) { new (to) nma::Materi
 nma::InstructionSet set_of(int number) { return static_cast<nma::InstructionSet>(number - NMA_PORTABLE); }
 nma::Direction direction(const float* v) { return {v[0], v[1], v[2]}; }
 
+constexpr int BLOCK = nma::Adapter::BLOCK;
+
+// Calls `work(first, count)` for blocks of queries, whose first is the number `first` of all.
+template <class F>
+void in_blocks(int count, F work) {
+    for (int first = 0; first < count; first += BLOCK) work(static_cast<size_t>(first), std::min(BLOCK, count - first));
+}
+
+// At most BLOCK materials, for cosines or directions.
+template <class View>
+void prepare_block(const nma::Adapter& adapter, int count, const float* parameters, const View* views, nma_material* materials) {
+    nma::Material block[BLOCK];
+    adapter.prepare_many(count, parameters, views, block);
+    for (int k = 0; k < count; ++k) put(materials + k, block[k]);
+}
+
+// At most BLOCK directions from their rows.
+struct Directions {
+    nma::Direction wi[BLOCK];
+
+    Directions(int count, const float* rows) {
+        for (int k = 0; k < count; ++k) wi[k] = direction(rows + 3 * k);
+    }
+};
+
 // What `make` returns, or null with the reason in `message`.
 template <class F>
 nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
@@ -61,25 +86,47 @@ void nma_free(nma_adapter* adapter) { delete adapter; }
 int nma_parameter_count(const nma_adapter* a) { return a->adapter.parameter_count(); }
 int nma_output_count(const nma_adapter* a) { return a->adapter.output_count(); }
 int nma_instruction_set(const nma_adapter* a) { return static_cast<int>(a->adapter.instruction_set()) + NMA_PORTABLE; }
+int nma_anisotropic(const nma_adapter* a) { return a->adapter.anisotropic(); }
 
 void nma_prepare(const nma_adapter* a, const float* parameters, float cos_theta_i, nma_material* material) {
     put(material, a->adapter.prepare(parameters, cos_theta_i));
 }
 
 void nma_prepare_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i, nma_material* materials) {
-    nma::Material block[nma::Adapter::BLOCK];
-    for (int first = 0; first < count; first += nma::Adapter::BLOCK) {
-        const int now = std::min(nma::Adapter::BLOCK, count - first);
-        a->adapter.prepare_many(now, parameters + static_cast<size_t>(first) * a->adapter.parameter_count(), cos_theta_i + first, block);
-        for (int k = 0; k < now; ++k) put(materials + first + k, block[k]);
-    }
+    in_blocks(count, [&](size_t first, int now) {
+        prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), cos_theta_i + first, materials + first);
+    });
+}
+
+void nma_prepare_direction(const nma_adapter* a, const float* parameters, const float* wi, nma_material* material) {
+    put(material, a->adapter.prepare(parameters, direction(wi)));
+}
+
+void nma_prepare_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi, nma_material* materials) {
+    in_blocks(count, [&](size_t first, int now) {
+        const Directions rows(now, wi + 3 * first);
+        prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), rows.wi, materials + first);
+    });
 }
 
 void nma_outputs_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i, float* outputs) {
     a->adapter.network_outputs_many(count, parameters, cos_theta_i, outputs);
 }
 
-nma_curves* nma_curves_new(const nma_adapter* a, const float* parameters) { return new (std::nothrow) nma_curves{nma::Curves(a->adapter, parameters)}; }
+void nma_outputs_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi, float* outputs) {
+    in_blocks(count, [&](size_t first, int now) {
+        const Directions rows(now, wi + 3 * first);
+        a->adapter.network_outputs_many(now, parameters + first * a->adapter.parameter_count(), rows.wi, outputs + first * a->adapter.output_count());
+    });
+}
+
+nma_curves* nma_curves_new(const nma_adapter* a, const float* parameters) {
+    try {
+        return new nma_curves{nma::Curves(a->adapter, parameters)};
+    } catch (const std::exception&) {
+        return nullptr;
+    }
+}
 void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material) { put(material, curves->curves.at(cos_theta_i)); }
 void nma_curves_free(nma_curves* curves) { delete curves; }
 

@@ -1,8 +1,8 @@
 /* Neural Material Adapter for C, and for whatever calls C: see nma.h for what the functions do.
  *
  * Compile nma_c.cpp beside your code, or link the library nma_c. Pointers are to arrays of floats; directions are unit
- * vectors in the local frame, z up. An adapter may be shared by threads. Only loading can fail: it returns NULL and says
- * why in `message`. */
+ * vectors in the local frame, z up. An adapter may be shared by threads. Only loading and `nma_curves_new` can fail: they
+ * return NULL, and loading says why in `message`. */
 #ifndef NMA_C_H
 #define NMA_C_H
 
@@ -46,14 +46,21 @@ NMA_C_API void nma_free(nma_adapter* adapter);
 NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
 NMA_C_API int nma_output_count(const nma_adapter* adapter);
 NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
+/* Whether the view's azimuth matters. Cosines alone stand for the azimuth 0 then: give directions. */
+NMA_C_API int nma_anisotropic(const nma_adapter* adapter);
 
 NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i, nma_material* material);
 NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, nma_material* materials);
 
+/* The same seen from directions, three floats each; of isotropic adapters only their z matters. */
+NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi, nma_material* material);
+NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters, const float* wi, nma_material* materials);
+
 /* Raw outputs of the network, `nma_output_count` for each query. */
 NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, float* outputs);
+NMA_C_API void nma_outputs_direction_many(const nma_adapter* adapter, int count, const float* parameters, const float* wi, float* outputs);
 
-/* Curves of an untextured material. */
+/* Curves of an untextured material. NULL for an anisotropic adapter, which has none, and where memory is short. */
 NMA_C_API nma_curves* nma_curves_new(const nma_adapter* adapter, const float* parameters);
 NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material);
 NMA_C_API void nma_curves_free(nma_curves* curves);

@@ -4,26 +4,38 @@ import numpy as np
 
 from nma import encoding, network, target
 from nma.adapter import Adapter
-from nma.params import LAYERED3
-from nma.target import PRINCIPLED_PARAMS
+from nma.params import LAYERED3, MEASURED
+from nma.target import ANISOTROPIC_PARAMS, PRINCIPLED_PARAMS
 
 VARIANTS = {"single": (1, False), "blended": (2, False), "omega_i": (1, True), "blended + omega_i": (2, True)}
 
 
 def random_adapter(
-    instances=2, directional=True, name="layered3", hidden="3x32", seed=0, params=PRINCIPLED_PARAMS
+    instances=2,
+    directional=True,
+    name="layered3",
+    hidden="3x32",
+    seed=0,
+    params=PRINCIPLED_PARAMS,
+    space=LAYERED3,
 ):
     """An adapter that was not trained, with outputs that vary over the class."""
     rng = np.random.default_rng(seed)
     sizes = [
-        encoding.size(name, LAYERED3, directional),
+        encoding.size(name, space, directional),
         *network.hidden(hidden),
         target.output_size(instances, params),
     ]
     layers = [(m, 0.3 * rng.standard_normal(b.shape).astype(np.float32)) for m, b in network.init(rng, sizes)]
     layers[-1] = (10.0 * layers[-1][0], layers[-1][1])
     record = {"data": "none", "seed": seed}
-    return Adapter(LAYERED3, name, layers, instances, directional, params, record)
+    return Adapter(space, name, layers, instances, directional, params, record)
+
+
+def random_anisotropic_adapter(hidden="3x32", seed=0):
+    """Of a single material whose looks change with the view's azimuth."""
+    about = {"name": "azimuth", "params": ANISOTROPIC_PARAMS, "space": MEASURED}
+    return random_adapter(hidden=hidden, seed=seed, **about)
 
 
 def materials(n, seed=1):

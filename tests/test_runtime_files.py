@@ -18,6 +18,7 @@ from nma.export.functions import Unsupported, parsed
 from nma.runtime import Runtime
 
 ROOT = Path(__file__).parent.parent
+IN_PLANE = {"name": "metallic", "size": 1, "low": 0, "high": 1, "scale": "linear", "in_plane": True}
 
 
 def stored(name):
@@ -53,6 +54,9 @@ def changed(name, **fields):
         (changed("layered3-3x32", hidden=[32, 32, 31]), "hidden layers"),
         (changed("layered3-3x32", hidden="many"), "'hidden'"),
         (changed("layered3-3x32", target=[]), "does not fit its description"),
+        (changed("layered3-3x32", encoding="azimuth"), "does not fit its description"),
+        (changed("layered3-3x32", encoding="azimuth", target=[IN_PLANE]), "holds in the plane of incidence"),
+        (changed("layered3-3x32", encoding="azimuth", directional=False), "ignores the direction"),
     ],
 )
 def test_files_that_make_no_sense_are_refused(tmp_path, data, message):

@@ -1,4 +1,4 @@
-// What the network reads: a material's parameters and cos(theta_i), turned into about unit-sized numbers. Twin of
+// What the network reads: a material's parameters and the view direction, turned into about unit-sized numbers. Twin of
 // nma/encoding.py.
 #pragma once
 
@@ -27,7 +27,16 @@ public:
 
     // Numbers that it takes, and that the network was trained on.
     int parameters() const { return parameters_; }
-    int size() const { return kind_ == Kind::Direction ? 1 : kind_ == Kind::Raw ? parameters_ + directional_ : 13 + 3 * directional_; }
+    int size() const {
+        switch (kind_) {
+            case Kind::Raw: return parameters_ + directional_;
+            case Kind::Direction: return 1;
+            case Kind::Azimuth: return 5;
+            default: return 13 + 3 * directional_;
+        }
+    }
+    // Whether the view's azimuth matters: `encode` reads all of wi, otherwise wi.z alone.
+    bool anisotropic() const { return kind_ == Kind::Azimuth; }
 
     // The network's first layer for numbers in the order of `encode`.
     Layer arranged(const Layer& first) const {
@@ -39,31 +48,38 @@ public:
     }
 
     // `x` is padded with zeros to `stride`.
-    void encode(const float* p, float cosine, float* x, int stride) const {
-        if (kind_ == Kind::Layered3) return layered3(p, cosine, x);
+    void encode(const float* p, const Vec3<float>& wi, float* x, int stride) const {
+        if (kind_ == Kind::Layered3) return layered3(p, wi.z, x);
         float* const end = x + stride;
-        if (kind_ == Kind::Direction) {
-            *x++ = directional_ ? 2.0f * cosine - 1.0f : 1.0f;
-        } else {
+        if (kind_ == Kind::Raw) {
             x = std::copy_n(p, parameters_, x);
-            if (directional_) *x++ = cosine;
+            if (directional_) *x++ = wi.z;
+        } else {
+            *x++ = directional_ ? 2.0f * wi.z - 1.0f : 1.0f;
+            if (kind_ == Kind::Azimuth) x = azimuth(wi, x);
         }
         std::fill(x, end, 0.0f);
     }
 
 private:
-    enum class Kind { Raw, Direction, Layered3 };
+    enum class Kind { Raw, Direction, Azimuth, Layered3 };
 
     static Kind kind_named(const std::string& name) {
         if (name == "raw") return Kind::Raw;
         if (name == "direction") return Kind::Direction;
+        if (name == "azimuth") return Kind::Azimuth;
         if (name == "layered3") return Kind::Layered3;
-        if (name == "azimuth") throw Error("an anisotropic adapter, which the runtime does not evaluate; Mitsuba's BSDF `nma` does");
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
     // Four scalars, three colours, and in the fourth lanes of those what depends on the direction.
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
+
+    // The azimuth once and twice, both of which fade towards normal incidence, where there is none. Returns their end.
+    static float* azimuth(const Vec3<float>& wi, float* x) {
+        const float numbers[] = {wi.x, wi.y, wi.x * wi.x - wi.y * wi.y, 2.0f * wi.x * wi.y};
+        return std::copy_n(numbers, 4, x);
+    }
 
     NMA_INLINE void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;

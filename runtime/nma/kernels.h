@@ -90,11 +90,11 @@ struct Kernels {
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs, int output_stride);
     // What comes before the network and after it, `raw` aligned to 64 bytes. CPUs that run their widest vectors on fewer units
     // run `odds`, whose vectors are narrow, at half its speed among them: batches keep the two apart.
-    void (*encode)(const Recipe&, const float* parameters, float cosine, float* inputs);
+    void (*encode)(const Recipe&, const float* parameters, const Vec3<float>& wi, float* inputs);
     void (*decode)(const Recipe&, float* raw, float cosine, Blend<float>&);
     void (*odds)(const Recipe&, float cosine, Blend<float>&);
     // All of it for one query.
-    void (*prepare)(const Recipe&, const float* parameters, float cosine, Blend<float>&);
+    void (*prepare)(const Recipe&, const float* parameters, const Vec3<float>& wi, Blend<float>&);
 };
 
 // Those of `set`; the portable ones if it cannot run here.

@@ -11,13 +11,13 @@ namespace {
 
 constexpr int QUERIES = 1000;
 
-std::vector<float> outputs(const nma::Adapter& adapter, const std::vector<float>& parameters, const std::vector<float>& cosines, bool batch) {
+std::vector<float> outputs(const nma::Adapter& adapter, const std::vector<float>& parameters, const std::vector<nma::Direction>& wi, bool batch) {
     std::vector<float> found(static_cast<std::size_t>(QUERIES) * adapter.output_count());
-    if (batch) adapter.network_outputs_many(QUERIES, parameters.data(), cosines.data(), found.data());
+    if (batch) adapter.network_outputs_many(QUERIES, parameters.data(), wi.data(), found.data());
     else
         for (int q = 0; q < QUERIES; ++q) {
             alignas(64) float raw[nma::WIDEST_LAYER];
-            adapter.network_outputs(&parameters[static_cast<std::size_t>(q) * adapter.parameter_count()], cosines[q], raw);
+            adapter.network_outputs(&parameters[static_cast<std::size_t>(q) * adapter.parameter_count()], wi[q], raw);
             std::copy_n(raw, adapter.output_count(), &found[static_cast<std::size_t>(q) * adapter.output_count()]);
         }
     return found;
@@ -33,19 +33,21 @@ int main(int count, char** words) {
     const nma::Adapter portable = nma::Adapter::load(words[1], {nma::InstructionSet::portable, false});
     std::mt19937 engine(1);
     std::uniform_real_distribution<float> uniform;
-    std::vector<float> parameters, cosines;
+    std::vector<float> parameters;
+    std::vector<nma::Direction> wi;
     for (int q = 0; q < QUERIES; ++q) {
-        cosines.push_back(uniform(engine));
+        const float z = uniform(engine), r = std::sqrt(1.0f - z * z), phi = 6.2831853f * uniform(engine);
+        wi.push_back({r * std::cos(phi), r * std::sin(phi), z});
         for (const nma::SourceParam& p : portable.parameters())
             for (int c = 0; c < p.size; ++c) parameters.push_back(static_cast<float>(p.low + (p.high - p.low) * uniform(engine)));
     }
-    const std::vector<float> wanted = outputs(portable, parameters, cosines, false);
+    const std::vector<float> wanted = outputs(portable, parameters, wi, false);
     bool fine = true;
     for (const nma::InstructionSet set : nma::INSTRUCTION_SETS) {
         if (!nma::supported(set)) continue;
         const nma::Adapter adapter = nma::Adapter::load(words[1], {set, false});
         for (const bool batch : {false, true}) {
-            const std::vector<float> found = outputs(adapter, parameters, cosines, batch);
+            const std::vector<float> found = outputs(adapter, parameters, wi, batch);
             double worst = 0.0, squares = 0.0;
             for (std::size_t k = 0; k < wanted.size(); ++k) {
                 const double error = std::abs(found[k] - wanted[k]) / (1.0 + std::abs(wanted[k]));

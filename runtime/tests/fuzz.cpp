@@ -18,8 +18,8 @@ bool attempt(const std::uint8_t* data, std::size_t size) {
     try {
         const nma::Adapter adapter = nma::Adapter::from_memory(data, size);
         const std::vector<float> parameters(adapter.parameter_count(), 0.5f);
-        const nma::Material material = adapter.prepare(parameters.data(), 0.5f);
-        const nma::Direction wi{0.8660254f, 0.0f, 0.5f};
+        const nma::Direction wi{0.5196152f, 0.6928203f, 0.5f};
+        const nma::Material material = adapter.prepare(parameters.data(), wi);
         volatile float sink = material.eval(wi, {0.0f, 0.6f, 0.8f}).pdf;
         sink = material.sample(wi, 0.3f, 0.4f, 0.5f).pdf;
         (void)sink;

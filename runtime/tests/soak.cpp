@@ -59,7 +59,7 @@ const char* round_of_calls(const nma::Adapter& adapter, Random& random) {
     float parameters[64];
     draw_parameters(adapter, random, parameters);
     const nma::Direction wi = draw_direction(random);
-    const nma::Material material = adapter.prepare(parameters, wi.z);
+    const nma::Material material = adapter.prepare(parameters, wi);
     for (int k = 0; k < CALLS_PER_ROUND / 6; ++k) {
         const nma::Direction wo = draw_direction(random);
         const nma::Value v = material.eval(wi, wo);

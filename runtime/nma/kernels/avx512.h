@@ -103,22 +103,22 @@ NMA_FN inline void forward_narrow(const NetworkView& view, const float* inputs, 
     store(outputs + LANES, y[1]);
 }
 
-NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
+NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, Blend<float>& blend) {
     alignas(64) float inputs[WIDEST_LAYER], numbers[NARROW];
     Vec y[2];
-    encode(recipe, parameters, cosine, inputs);
+    encode(recipe, parameters, wi, inputs);
     narrow(recipe.network, inputs, y);
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
-        y[v] = decoded(recipe.ranges, v * LANES, y[v], 1.0f - cosine * cosine);
+        y[v] = decoded(recipe.ranges, v * LANES, y[v], 1.0f - wi.z * wi.z);
         store(numbers + v * LANES, y[v]);
     }
     assemble(recipe, numbers, Few(y[0], y[1]), blend);
-    weigh(blend, cosine, recipe.bounded);
+    weigh(blend, wi.z, recipe.bounded);
 }
 
-NMA_FN inline void prepare_either(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
-    if (recipe.network.narrow) return prepare_narrow(recipe, parameters, cosine, blend);
-    prepare<forward>(recipe, parameters, cosine, blend);
+NMA_FN inline void prepare_either(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, Blend<float>& blend) {
+    if (recipe.network.narrow) return prepare_narrow(recipe, parameters, wi, blend);
+    prepare<forward>(recipe, parameters, wi, blend);
 }
 
 }  // namespace nma::avx512

@@ -99,8 +99,8 @@ NMA_OP Vec decoded(const Ranges& ranges, int k, Vec raw, float fade) {
     return k < ranges.logarithmic ? fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value) : value;
 }
 
-NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameters, float cosine, float* inputs) {
-    recipe.encoding.encode(parameters, cosine, inputs, recipe.network.layers[0].in);
+NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, float* inputs) {
+    recipe.encoding.encode(parameters, wi, inputs, recipe.network.layers[0].in);
 }
 
 // The blend of a network's outputs, but for its odds; those of a blend.
@@ -112,10 +112,10 @@ NMA_FN NMA_WHOLE inline void decode(const Recipe& recipe, float* raw, float cosi
 NMA_FN NMA_WHOLE inline void odds(const Recipe& recipe, float cosine, Blend<float>& blend) { weigh(blend, cosine, recipe.bounded); }
 
 template <void (*FORWARD)(const NetworkView&, const float*, float*)>
-NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, float cosine, Blend<float>& blend) {
+NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, Blend<float>& blend) {
     alignas(64) float inputs[WIDEST_LAYER], numbers[WIDEST_LAYER];
-    encode(recipe, parameters, cosine, inputs);
+    encode(recipe, parameters, wi, inputs);
     FORWARD(recipe.network, inputs, numbers);
-    decode(recipe, numbers, cosine, blend);
-    odds(recipe, cosine, blend);
+    decode(recipe, numbers, wi.z, blend);
+    odds(recipe, wi.z, blend);
 }
