@@ -1,12 +1,12 @@
 """The C++ runtime from Python, for many queries at once: a compiled library, made when it is first wanted.
 
     runtime = nma.runtime.Runtime("layered3-5x64")
-    materials = runtime.prepare(params, cos_theta_i)           # (n, 13), (n,)
+    materials = runtime.prepare(params, wi)                    # (n, 13), (n, 3)
     value, pdf = runtime.eval(materials, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
     wo, value, pdf = runtime.sample(materials, wi, u)
 
 Directions are unit vectors (n, 3) in the local frame, z up, `wi` towards the viewer, of the cosine that the material
-was prepared for. All arrays become float32.
+was prepared for; of anisotropic adapters, of the same direction. All arrays become float32.
 """
 
 from __future__ import annotations
@@ -46,6 +46,12 @@ class Runtime:
             compute in float32.
         compact: round weights to bfloat16, which is faster; `runtime/README.md` says what it costs.
 
+    Attributes:
+        parameters: numbers of a material that it takes, the columns of `params`.
+        size: numbers that the network returns.
+        instruction_set: the one in use.
+        anisotropic: whether the view's azimuth matters.
+
     Raises:
         WeightsError: a file that is missing or damaged.
         ParamError: an unknown instruction set.
@@ -66,19 +72,29 @@ class Runtime:
         self._handle = ctypes.c_void_p(handle)
         self.parameters = self._library.nma_parameter_count(self._handle)
         self.size = self._library.nma_output_count(self._handle)
+        self.anisotropic = bool(self._library.nma_anisotropic(self._handle))
         self.instruction_set = INSTRUCTION_SETS[self._library.nma_instruction_set(self._handle)]
 
     def __del__(self) -> None:
         if handle := getattr(self, "_handle", None):
             self._library.nma_free(handle)
 
-    def outputs(self, params: ArrayLike, cos_theta_i: ArrayLike) -> Array:
-        """What the network returns, before decoding: (n, size)."""
-        return self._many("nma_outputs_many", params, cos_theta_i, self.size)
+    def outputs(self, params: ArrayLike, wi: ArrayLike) -> Array:
+        """What the network returns, before decoding: (n, size). Arguments and errors are those of `prepare`."""
+        return self._many("nma_outputs", params, wi, self.size)
 
-    def prepare(self, params: ArrayLike, cos_theta_i: ArrayLike) -> Array:
-        """Materials for `eval` and `sample`, opaque rows, for parameters (n, parameters) and cosines (n,) in 0..1."""
-        return self._many("nma_prepare_many", params, cos_theta_i, _MATERIAL)
+    def prepare(self, params: ArrayLike, wi: ArrayLike) -> Array:
+        """Materials for `eval` and `sample`, opaque rows.
+
+        Args:
+            params: (n, parameters), within the training range.
+            wi: directions (n, 3), unit vectors above the horizon; or, for isotropic adapters, which look at nothing
+                else, their cosines (n,) in 0..1.
+
+        Raises:
+            ParamError: other shapes, different lengths, or cosines for an anisotropic adapter.
+        """
+        return self._many("nma_prepare", params, wi, _MATERIAL)
 
     def eval(self, materials: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
         """f cos(theta_o) [1/sr] (n, 3) and the density of `sample` [1/sr] (n,), both 0 below the horizon."""
@@ -91,14 +107,26 @@ class Runtime:
         found = self._each("nma_sample", materials, wi, u, 7)
         return found[:, :3], found[:, 3:6], found[:, 6]
 
-    def _many(self, name: str, params: ArrayLike, cos_theta_i: ArrayLike, width: int) -> Array:
-        rows, cosines = _rows("params", params, self.parameters), _rows("cos_theta_i", cos_theta_i)
-        if len(rows) != len(cosines):
-            raise ParamError(f"{len(rows)} rows of params for {len(cosines)} cosines")
+    def _many(self, name: str, params: ArrayLike, wi: ArrayLike, width: int) -> Array:
+        rows, views = _rows("params", params, self.parameters), self._views(wi)
+        kind, suffix = ("cosines", "_many") if views.ndim == 1 else ("directions", "_direction_many")
+        if len(rows) != len(views):
+            raise ParamError(f"{len(rows)} rows of params for {len(views)} {kind}")
         found = np.empty((len(rows), width), np.float32)
-        call = getattr(self._library, name)
-        call(self._handle, len(rows), *(_pointer(a) for a in (rows, cosines, found)))
+        call = getattr(self._library, name + suffix)
+        call(self._handle, len(rows), *(_pointer(a) for a in (rows, views, found)))
         return found
+
+    def _views(self, wi: ArrayLike) -> Array:
+        """Directions (n, 3), or cosines (n,) where they are enough."""
+        shape = np.shape(wi)
+        if len(shape) > 1:
+            return _rows("wi", wi, 3)
+        if self.anisotropic:
+            raise ParamError(
+                f"an anisotropic adapter wants whole directions: give wi of shape (n, 3), not cosines {shape}"
+            )
+        return _rows("wi", wi)
 
     def _each(self, name: str, materials: Array, first: ArrayLike, second: ArrayLike, width: int) -> Array:
         arrays = _rows("materials", materials, _MATERIAL), _rows("wi", first, 3), _rows("wo or u", second, 3)
