@@ -1,5 +1,6 @@
 """Plugins compiled for Mitsuba's scalar renderer against the vectorised ones, in processes of their own."""
 
+import dataclasses
 import json
 import math
 import os
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from adapter_cases import random_anisotropic_adapter
 
 import nma
 from nma import encoding, native, network
@@ -54,6 +56,8 @@ PROGRAM = """
         })
         pictures = [np.array(mi.render(scene, spp=spp, seed=10 * seed + k)).mean(axis=(0, 1)) for k in range(6)]
         print(json.dumps(np.array(pictures).tolist()))
+        ball, = (shape for shape in scene.shapes() if not shape.is_emitter())
+        print(mi.has_flag(ball.bsdf().flags(), mi.BSDFFlags.Anisotropic))
 """
 
 
@@ -79,11 +83,20 @@ def run(*words):
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-def pictures(variant, spp, *bsdfs):
-    """Mean colours (6, 3) of six renderings of each BSDF."""
+def finished(variant, spp, *bsdfs):
+    """The lines that it prints."""
     done = run(variant, spp, *bsdfs)
     assert done.returncode == 0, done.stderr[-2000:]
-    return [np.array(json.loads(line)) for line in done.stdout.splitlines() if line.startswith("[[")]
+    return done.stdout.splitlines()
+
+
+def parsed(lines):
+    """Mean colours (6, 3) of six renderings of each BSDF."""
+    return [np.array(json.loads(line)) for line in lines if line.startswith("[[")]
+
+
+def pictures(variant, spp, *bsdfs):
+    return parsed(finished(variant, spp, *bsdfs))
 
 
 def agree(a, b):
@@ -102,6 +115,22 @@ def test_scalar_and_vectorised_plugins_render_the_same():
     assert agree(scalar[-1], vectorised[0])
     # Materials differ by more than that: the comparison can fail.
     assert not agree(scalar[0], vectorised[2])
+
+
+def test_anisotropic_adapters_render_the_same_in_both(tmp_path):
+    """And otherwise than one that is blind to the azimuth."""
+    adapter = random_anisotropic_adapter()
+    (matrix, bias), *rest = adapter.layers
+    blind = dataclasses.replace(adapter, layers=[(matrix * np.float32([1, 0, 0, 0, 0]), bias), *rest])
+    bsdfs = []
+    for name, made in (("seeing", adapter), ("blind", blind)):
+        made.save(tmp_path / f"{name}.safetensors")
+        bsdfs.append({"type": "nma", "adapter": str(tmp_path / f"{name}.safetensors")})
+    scalar, vectorised = finished("scalar_rgb", 32, bsdfs[0]), finished("llvm_ad_rgb", 128, *bsdfs)
+    assert "True" in scalar and "True" in vectorised
+    (mine,), (other, unseeing) = parsed(scalar), parsed(vectorised)
+    assert agree(mine, other), (mine.mean(axis=0), other.mean(axis=0))
+    assert not agree(mine, unseeing)
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,9 @@
 //
 // Properties, as of the Python BSDF of the same name: `adapter`, a shipped adapter's name or a weights file; `clamp`; and
 // the parameters of the adapter's class. Beside them, `online`: whether the network also runs at every shading point of a
-// material without textures, which otherwise becomes curves over cos(theta_i) when it is loaded; and `precision`: "float32",
-// "compact" (weights of eight bits, faster), or "bfloat16" (activations too, where the CPU has products of such).
+// material without textures, which otherwise, unless it is anisotropic, becomes curves over cos(theta_i) when it is loaded;
+// and `precision`: "float32", "compact" (weights of eight bits, faster), or "bfloat16" (activations too, where the CPU has
+// products of such).
 #include <mitsuba/core/fresolver.h>
 
 #include "inputs.h"
@@ -22,8 +23,9 @@ public:
           inputs_(props, adapter_.parameters(), true) {
         const bool online = props.get<bool>("online", false);
         m_flags = inputs_.flags();
+        if (adapter_.anisotropic()) m_flags = m_flags | BSDFFlags::Anisotropic;
         m_components.push_back(m_flags);
-        if (inputs_.textured() || online) return;
+        if (inputs_.textured() || online || adapter_.anisotropic()) return;
         float parameters[MOST_PARAMETERS];
         inputs_.at(dr::zeros<SurfaceInteraction3f>(), parameters);
         curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
@@ -86,7 +88,7 @@ private:
         if (curves_) return curves_->at(cosine);
         float parameters[MOST_PARAMETERS];
         inputs_.at(si, parameters);
-        return adapter_.prepare(parameters, cosine);
+        return adapter_.prepare(parameters, nma::Direction{static_cast<float>(si.wi.x()), static_cast<float>(si.wi.y()), cosine});
     }
 
     static std::pair<Spectrum, Float> evaluated(const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) {
