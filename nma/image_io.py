@@ -92,12 +92,20 @@ def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) 
         raise ImageError(f"{path}: cannot write an array of shape {array.shape} as an image")
     kind = mi.Bitmap.PixelFormat.MultiChannel if channels else None
     bitmap = mi.Bitmap(array, kind, list(channels))
-    with second_thread():
+    with _second_thread():
         return _write_atomically(path, lambda temporary: bitmap.write(str(temporary)))
 
 
+def load_bitmap(path: str | Path) -> Any:
+    """The file as Mitsuba's bitmap. Raises `RuntimeError` where Mitsuba cannot decode it."""
+    import mitsuba as mi
+
+    with _second_thread():
+        return mi.Bitmap(str(path))
+
+
 @contextmanager
-def second_thread() -> Iterator[None]:
+def _second_thread() -> Iterator[None]:
     """Where the process has one core, lends Mitsuba a thread: its EXR files wait for a second one, else forever."""
     import drjit as dr
 
@@ -124,8 +132,7 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
     if not Path(path).is_file():
         raise ImageError(f"image {path} does not exist")
     try:
-        with second_thread():
-            bitmap = mi.Bitmap(str(path))
+        bitmap = load_bitmap(path)
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = _colours(bitmap)
         return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))

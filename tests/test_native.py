@@ -17,7 +17,7 @@ from adapter_cases import random_anisotropic_adapter
 import nma
 from nma import encoding, native, network
 from nma.errors import MissingDependencyError
-from nma.image_io import write_exr
+from nma.image_io import write_exr, write_png
 
 MATERIAL = {
     "alpha_top": 0.08,
@@ -172,6 +172,15 @@ def test_textures_are_checked_when_they_are_loaded(tmp_path, pixel, extra, messa
     texture = {"type": "bitmap", "filename": str(write_exr(tmp_path / "t.exr", image)), "raw": True}
     done = run("scalar_rgb", 1, {"type": "nma", **MATERIAL, "sigma_t": texture, **extra})
     assert message in done.stderr if message else done.returncode == 0
+
+
+def test_bytes_are_checked_as_what_they_are_decoded_to(tmp_path):
+    """sRGB 128 is .2158605 (IEC 61966-2-1), 128 / 255 where the texture is `raw`."""
+    write_png(tmp_path / "t.png", np.full((2, 2, 3), 128, np.uint8))
+    for raw, value in ((False, "0.21586"), (True, "0.501961")):
+        texture = {"type": "bitmap", "filename": str(tmp_path / "t.png"), "raw": raw}
+        done = run("scalar_rgb", 1, {"type": "nma", **MATERIAL, "eta_top": texture})
+        assert f"the texture of eta_top holds {value}" in done.stderr
 
 
 def test_the_executable_renders_a_scene(cache, tmp_path):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nma.data import load_conductors
 from nma.errors import MaterialError, ParamError, TextureError
-from nma.image_io import second_thread
+from nma.image_io import load_bitmap
 from nma.params import SPACES, Param, ParamSpace
 
 __all__ = ["Material", "Texture", "load", "names"]
@@ -65,8 +65,7 @@ def _read_image(path: Path, channels: int, raw: bool) -> NDArray[np.float32]:
     if not path.is_file():
         raise TextureError(f"texture {path} does not exist")
     try:
-        with second_thread():
-            bitmap = mi.Bitmap(str(path))
+        bitmap = load_bitmap(path)
     except RuntimeError as error:
         raise TextureError(f"texture {path} cannot be read: {str(error).splitlines()[0]}") from error
     if raw:

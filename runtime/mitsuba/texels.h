@@ -1,11 +1,11 @@
 // The numbers that a texture is made of, as far as they are known before anything is rendered.
 #pragma once
 
+#include <drjit/color.h>
 #include <drjit/tensor.h>
 #include <mitsuba/core/object.h>
 #include <mitsuba/core/spectrum.h>
 
-#include <cmath>
 #include <utility>
 #include <vector>
 
@@ -57,8 +57,7 @@ private:
         for (std::size_t k = 0; k < tensor.size(); ++k) {
             float x = static_cast<float>(tensor.array().entry(k));
             if (std::is_same_v<T, uint8_t>) x /= 255.0f;
-            if (srgb) x = x <= 0.04045f ? x / 12.92f : std::pow((x + 0.055f) / 1.055f, 2.4f);
-            texels.numbers.push_back(x);
+            texels.numbers.push_back(srgb ? dr::srgb_to_linear(x) : x);
         }
         found.push_back(std::move(texels));
         return true;
