@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,6 +23,8 @@ from nma.network import Layers
 from nma.params import SPACES, ParamSpace
 
 FORMAT = 1
+# Brackets within brackets of the metadata; those of files that were trained nest 4 deep.
+MAX_DEPTH = 32
 
 
 @dataclass(frozen=True)
@@ -77,20 +80,35 @@ def read(path: str | Path) -> tuple[Header, Layers]:
     try:
         with safe_open(path, framework="numpy") as f:
             metadata = f.metadata() or {}
-            tensors = {name: f.get_tensor(name) for name in f.keys()}  # noqa: SIM118
+            types = {name: f.get_slice(name).get_dtype() for name in f.keys()}  # noqa: SIM118
+            tensors = {name: f.get_tensor(name) for name, kind in types.items() if kind == "F32"}
     except (SafetensorError, OSError, ValueError, TypeError) as e:
         raise WeightsError(
             f"{path}: truncated, or not a safetensors file ({e}); copy or train it again"
         ) from None
     if "nma" not in metadata:
         raise WeightsError(f"{path}: a safetensors file without NMA metadata; `nma train` writes adapters")
+    _check_types(path, types)
     header = _header(path, metadata["nma"])
     _check_class(path, header)
     return header, _layers(path, header, tensors)
 
 
+def _check_types(path: Path, types: Mapping[str, str]) -> None:
+    """Refuses tensors of other numbers than those that are written."""
+    for name, kind in types.items():
+        if kind != "F32":
+            raise WeightsError(
+                f"{path}: tensor '{name}' holds numbers of type {kind}, weights are F32; convert or train it again"
+            )
+
+
 def _header(path: Path, text: str) -> Header:
     """The header from its JSON, every field of the type that it is declared with."""
+    if _depth(text) > MAX_DEPTH:
+        raise WeightsError(
+            f"{path}: its metadata nests {_depth(text)} deep, at most {MAX_DEPTH} is read; copy or train it again"
+        )
     try:
         header = Header(**json.loads(text))
     except (TypeError, ValueError) as e:
@@ -103,6 +121,15 @@ def _header(path: Path, text: str) -> Header:
                 f"{path}: its metadata has {getattr(header, name)!r} as '{name}'; copy or train it again"
             )
     return header
+
+
+def _depth(text: str) -> int:
+    """How deep the brackets of a JSON text nest, those within its strings aside."""
+    depth = deepest = 0
+    for token in re.findall(r'"(?:[^"\\]|\\.)*"|[\[{\]}]', text, re.DOTALL):
+        depth += (token in "[{") - (token in "]}")
+        deepest = max(deepest, depth)
+    return deepest
 
 
 def _check_class(path: Path, header: Header) -> None:
@@ -145,7 +172,7 @@ def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layer
             )
         if not (np.isfinite(matrix).all() and np.isfinite(bias).all()):
             raise WeightsError(f"{path}: layer {number} holds numbers that are not finite; train again")
-        layers.append((matrix.astype(np.float32), bias.astype(np.float32)))
+        layers.append((matrix, bias))
     if [m.shape[0] for m, _ in layers[:-1]] != header.hidden:
         raise WeightsError(
             f"{path}: its hidden layers are not the {header.hidden} of its metadata; train again"

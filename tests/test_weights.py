@@ -139,6 +139,20 @@ def _parameters(header, number, **changes):
     return {**header, "parameters": rows}
 
 
+def _target(header, **changes):
+    """With another declaration of `roughness`."""
+    rows = [dict(p) for p in header["target"]]
+    rows[1] |= changes
+    return {**header, "target": rows}
+
+
+def _nested(depth):
+    value = []
+    for _ in range(depth - 1):
+        value = [value]
+    return value
+
+
 HEADERS = {
     "another format": (lambda h: _with(h, format=2), "format 2, this version reads 1; upgrade"),
     "another class": (
@@ -170,6 +184,17 @@ HEADERS = {
         "glow",
     ),
     "target of words": (lambda h: _with(h, target=[{**h["target"][1], "low": "little"}]), ""),
+    "target of integers too long": (lambda h: _target(h, high=10**400), "no valid range within"),
+    "target beyond all bounds": (lambda h: _target(h, high=1e300), r"no valid range within 0 \.\. 1"),
+    "target infinite": (lambda h: _target(h, high=float("inf")), "no valid range"),
+    "target not a number": (lambda h: _target(h, low=float("nan")), "no valid range"),
+    "target negative": (lambda h: _target(h, low=-1.0), "no valid range"),
+    "target of truths": (lambda h: _target(h, low=False), "no pair of numbers"),
+    "target of broken size": (lambda h: _target(h, size=1.0), "with its size"),
+    "target in a plane of words": (lambda h: _target(h, in_plane="no"), "no plane of incidence"),
+    "target twice": (lambda h: _with(h, target=[*h["target"][:3], *h["target"][1:]]), "each name once"),
+    "target without a colour": (lambda h: _with(h, target=h["target"][1:]), "want a base_color"),
+    "nested without end": (lambda h: _with(h, training={"a": _nested(900)}), "nests 902 deep, at most 32"),
     "target no table": (lambda h: _with(h, target=["roughness"]), "malformed"),
     "a list": (lambda h: [h], "metadata of another version"),
 }
@@ -215,10 +240,31 @@ def test_tensors_that_do_not_fit_are_refused(path, change):
     assert re.search(message, refusal(path))
 
 
-def test_other_precisions_are_read_as_single(path):
+@pytest.mark.parametrize("depth", (40, 2000, 100_000))
+@pytest.mark.parametrize("brackets", ("[]", "{}"))
+def test_metadata_nested_without_end_is_refused(path, depth, brackets):
+    """Whole or cut off, before anything recurses; brackets within strings nest nothing."""
+    opening = brackets[0] if brackets == "[]" else '{"a":'
+    _, tensors = parts(path)
+    for text in (opening * depth, opening * depth + "0" + brackets[1] * depth):
+        path.write_bytes(save(tensors, metadata={"nma": text}))
+        assert f"nests {depth} deep" in refusal(path)
+
+
+def test_brackets_in_strings_nest_nothing(path, tmp_path):
+    adapter = Adapter.load(path)
+    replace(adapter, training={"data": '[{"\\' * 100}).save(tmp_path / "words.safetensors")
+    assert Adapter.load(tmp_path / "words.safetensors").training["data"].count("[") == 100
+
+
+@pytest.mark.parametrize("kind", (np.int32, np.int64, np.uint8, np.float16, np.float64))
+def test_weights_of_other_numbers_are_refused(path, kind):
     metadata, tensors = parts(path)
-    path.write_bytes(save({k: v.astype(np.float64) for k, v in tensors.items()}, metadata=metadata))
-    assert Adapter.load(path).layers[0][0].dtype == np.float32
+    for name in ("layer0.weight", "layer2.bias"):
+        path.write_bytes(save(tensors | {name: tensors[name].astype(kind)}, metadata=metadata))
+        assert f"tensor '{name}' holds numbers of type {np.dtype(kind).kind.upper()}" in refusal(path)
+    path.write_bytes(save(tensors | {"codes": np.zeros((2, 32), kind)}, metadata=metadata))
+    assert "tensor 'codes'" in refusal(path)
 
 
 def test_every_shipped_adapter_loads_and_works():

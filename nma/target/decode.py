@@ -82,6 +82,14 @@ MEASURED_PARAMS = (
 # The same for materials that know no plane of incidence but axes of their own: x and y of the surface.
 ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
+# What the Principled BRDF is defined for: the range of a parameter lies within. Others are numbers of 0 .. 1.
+_LIMITS = {
+    "specular": (0.0, 12.0),  # from 12.5 on there is no such index of refraction
+    "anisotropic": (-1e6, 1.0),
+    "fade": (-1.0, 1.0),
+    "fade_width": (0.0, 1e6),
+}
+
 TARGETS = {
     "principled": PRINCIPLED_PARAMS,
     "stretched": STRETCHED_PARAMS,
@@ -104,12 +112,26 @@ def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
             f"Target parameters are malformed ({e}); the file needs another version of nma."
         ) from e
     for p in params:
-        size = 3 if p.name == "base_color" else 1
-        ranged = p.low < p.high and (p.scale == "linear" or (p.scale == "log" and p.low > 0))
-        known = p.name in Principled._fields and p.size == size
-        if not (known and ranged) or (p.in_plane and p.name != "anisotropic"):
-            raise WeightsError(f"Target parameter {p} is not one of {Principled._fields} with a valid range.")
+        _check(p)
+    names = [p.name for p in params]
+    if "base_color" not in names or len(set(names)) < len(names):
+        raise WeightsError(f"Target parameters {names} want a base_color and each name once.")
     return params
+
+
+def _check(p: TargetParam) -> None:
+    """Refuses a parameter that `Principled` does not have, or a range that it is not defined for."""
+    size = 3 if p.name == "base_color" else 1
+    if p.name not in Principled._fields or type(p.size) is not int or p.size != size:
+        raise WeightsError(f"Target parameter {p} is not one of {Principled._fields} with its size.")
+    if type(p.in_plane) is not bool or (p.in_plane and p.name != "anisotropic"):
+        raise WeightsError(f"Target parameter {p} has no plane of incidence.")
+    if type(p.low) not in (int, float) or type(p.high) not in (int, float):
+        raise WeightsError(f"Target parameter {p} has a range that is no pair of numbers.")
+    low, high = _LIMITS.get(p.name, (0.0, 1.0))
+    scaled = p.scale == "linear" or (p.scale == "log" and p.low > 0)
+    if not (scaled and low <= p.low < p.high <= high):
+        raise WeightsError(f"Target parameter {p} has no valid range within {low:g} .. {high:g}.")
 
 
 def instance_size(params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
