@@ -134,13 +134,13 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
     try:
         bitmap = load_bitmap(path)
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-            bitmap = _colours(bitmap)
+            bitmap = coloured_layer(bitmap)
         return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
     except RuntimeError as error:
         raise ImageError(f"image {path} cannot be read: {error}") from error
 
 
-def _colours(bitmap: Any) -> Any:
+def coloured_layer(bitmap: Any) -> Any:
     """The first layer with red, green and blue, else the bitmap itself."""
     import mitsuba as mi
 

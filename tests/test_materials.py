@@ -1,5 +1,6 @@
 """Named materials, the format of their files, and the corpus of conductors."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from nma import materials
 from nma.data import load_conductors
-from nma.errors import MaterialError, TextureError
+from nma.errors import MaterialError, NmaError, TextureError
 from nma.params import LAYERED3
 
 ROOT = Path(__file__).parents[1]
@@ -121,11 +122,125 @@ def test_sources_take_what_adapters_do_not_know(write):
         ("albedo = 0.5", "albedo = { texture = 'none.png' }", "there is no texture .*none.png"),
         ("albedo = 0.5", "albedo = { texture = 'x', gain = 2 }", "unknown key 'gain'"),
         ("albedo = 0.5", "albedo = { scale = 2 }", "texture must be a file name"),
+        ('title = "Test"', "title = [1]", r"title is \[1\], but must be text"),
+        ('"layered3"', "['layered3']", "class is .*, but must be text"),
+        ('"layered3"', "{ a = 1 }", "class is .*, but must be text"),
+        ('"Au"', "['Au']", r"no conductor \['Au'\]"),
+        ("[parameters]", "parameters = 1\n[more]", "unknown key 'more'"),
+        ("alpha_top = 0.1", "alpha_top = { width = 1 }", "unknown key 'width'"),
+        ("alpha_top = 0.1", f"alpha_top = 1{'0' * 400}", r"alpha_top .* \[inf\]"),
+        ("alpha_top = 0.1", f"alpha_top = -1{'0' * 400}", r"alpha_top .* \[-inf\]"),
+        ("alpha_top = 0.1", f"alpha_top = 1{'0' * 9000}", "is no TOML file: Exceeds the limit"),
+        ("alpha_top = 0.1", f"alpha_top = [0x{'f' * 9000}, 1]", "too many digits, but must be a number"),
+        ("alpha_top = 0.1", "alpha_top = inf", r"alpha_top .* \[inf\]"),
+        ("alpha_top = 0.1", "alpha_top = 1979-05-27", "must be a number"),
+        ("alpha_top = 0.1", f"alpha_top = {'[' * 9000}{']' * 9000}", "nest too deep"),
+        ("alpha_top = 0.1", f"alpha_top{'.a' * 2000} = 1", "unknown key 'a'"),
+        ("alpha_top = 0.1", '"alpha\\ntop" = 1', r"unknown key 'alpha\\ntop'"),
+        ("albedo = 0.5", 'albedo = { texture = "a\\u0000b.png" }', r"there is no texture .*a\\x00b.png"),
+        ("albedo = 0.5", f"albedo = {{ texture = '{'x' * 5000}' }}", r"there is no texture .*x\.\.\."),
+        ("albedo = 0.5", "albedo = { texture = '.' }", "there is no texture"),
+        ("albedo = 0.5", "albedo = { texture = 'x', scale = nan }", "scale is nan, but must be a finite"),
+        (
+            "albedo = 0.5",
+            f"albedo = {{ texture = 'x', offset = 1{'0' * 400} }}",
+            "offset is .* must be a finite",
+        ),
+        ("albedo = 0.5", "albedo = { texture = 'x', scale = true }", "scale is True"),
+        ("albedo = 0.5", "albedo = '3366ee'", "a colour '#3366ee'"),
+        ("albedo = 0.5", "albedo = '#3366e'", "a colour has six digits"),
+        ("eta_top = 1.5", "eta_top = '#3366ee'", "eta_top is no colour"),
+        ('conductor = "Au"', "eta_conductor = '#3366ee'\nk_conductor = 1", "eta_conductor is no colour"),
+        ("[parameters]", "uv_scale = 0\n[parameters]", "uv_scale is 0, but must be above 0"),
+        ("[parameters]", "uv_scale = [1]\n[parameters]", "uv_scale is .*, but must be a finite number"),
     ],
 )
 def test_a_faulty_file_is_refused_with_its_name_and_the_fault(write, old, new, message):
-    with pytest.raises(MaterialError, match=f"test.toml.*{message}"):
+    with pytest.raises(MaterialError, match=f"test.toml.*{message}") as error:
         materials.load(write(old, new))
+    assert len(str(error.value)) < 1000 and "\n" not in str(error.value)
+
+
+# Values, keys and scraps that take the place of those of a good file.
+NASTY = (
+    "0.5",
+    "1",
+    "-1",
+    "1e999",
+    "nan",
+    "true",
+    '""',
+    "[]",
+    "[[1]]",
+    "{}",
+    "{ texture = 1 }",
+    "1979-05-27",
+    "=",
+    "#",
+)
+NASTY += (
+    "{ texture = 'test.toml', channel = 'g' }",
+    "{ texture = '' }",
+    "[parameters]",
+    "[[parameters]]",
+    "albedo",
+)
+NASTY += (
+    "'#3366ee'",
+    "'layered3'",
+    "'measured'",
+    "'library'",
+    '"\\u0000"',
+    "\0",
+    "\n",
+    "\ufeff",
+    "\ud800",
+    "title",
+)
+NASTY += ("[" * 3000, "1" * 400, "1" * 5000, "0x" + "f" * 9000, '"' + "a" * 5000 + '"', "a" + ".a" * 900)
+
+
+def test_whatever_a_file_holds_it_loads_or_is_refused_in_one_line(write):
+    """Values and keys of a good file replaced, one or two at a time, and sometimes a piece of it cut out."""
+    path, rng = write(), np.random.default_rng(0)
+    good = [re.split("( = )", line) for line in path.read_text().strip().splitlines()]
+    loaded = refused = 0
+    for _ in range(400):
+        lines = [list(parts) for parts in good]
+        for _ in range(rng.integers(1, 3)):
+            parts = lines[rng.integers(len(lines))]
+            parts[rng.choice([0, len(parts) - 1], p=[0.2, 0.8])] = NASTY[rng.integers(len(NASTY))]
+        text = "\n".join(map("".join, lines)).encode("utf-8", "surrogatepass")
+        start = rng.integers(len(text))
+        path.write_bytes(text[:start] + text[start + rng.choice([0, 0, 0, 1, 30]) :])
+        try:
+            materials.load(path)
+            loaded += 1
+        except NmaError as error:
+            assert len(str(error)) < 1000 and "\n" not in str(error)
+            refused += 1
+    assert loaded > 5 and refused > 200
+
+
+def test_a_byte_order_mark_is_fine_and_so_are_other_line_ends(write):
+    path = write()
+    plain = materials.load(path).vector()
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    np.testing.assert_array_equal(materials.load(path).vector(), plain)
+
+
+def test_a_file_that_is_too_large_is_not_read(write):
+    path = write()
+    path.write_text("#" * (materials.MAX_BYTES + 1))
+    with pytest.raises(MaterialError, match="1,048,576 bytes are no material file"):
+        materials.load(path)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a\0b.toml", "x" * 5000, "x" * 5000 + ".toml", "a\nb"])
+def test_a_name_that_no_file_can_have_is_refused(name):
+    with pytest.raises(MaterialError, match="there is no material") as error:
+        materials.load(name)
+    assert len(str(error.value)) < 700 and "\n" not in str(error.value)
 
 
 def test_an_unknown_name_is_refused_with_a_suggestion():
@@ -149,6 +264,99 @@ def test_colours_are_made_linear_and_numbers_are_not(write, tmp_path):
     number = materials.load(write("sigma_t = 0.25", f"sigma_t = {texture}")).values["sigma_t"]
     assert number.read().shape == (2, 4, 1)
     np.testing.assert_allclose(number.read(), 0.1 + 0.5 * 128 / 255, atol=1e-6)
+
+
+def test_a_colour_may_be_given_in_hexadecimal_digits_of_srgb(write):
+    """#3366ee is 51, 102, 238 of 255."""
+    for digits in ("#3366ee", "#3366EE"):
+        material = materials.load(write("albedo = 0.5", f"albedo = '{digits}'"))
+        np.testing.assert_allclose(material.values["albedo"], [0.0331048, 0.1328683, 0.8549926], rtol=1e-5)
+    edges = materials.load(write("albedo = 0.5", "albedo = '#000aff'")).values["albedo"]
+    np.testing.assert_allclose(edges, [0.0, 10 / 255 / 12.92, 1.0])
+    changed = materials.load(write()).changed({"albedo": "#3366ee"})
+    np.testing.assert_allclose(changed.values["albedo"], material.values["albedo"])
+
+
+PACKED = np.array([[[255, 25, 0, 128], [0, 51, 255, 255]]], np.uint8)
+
+
+@pytest.mark.parametrize("ending", ["png", "exr"])
+def test_a_channel_of_a_packed_image_is_chosen_by_its_letter(write, tmp_path, ending):
+    pixels = PACKED if ending == "png" else PACKED.astype(np.float32) / 255
+    write_image(tmp_path / f"orm.{ending}", pixels)
+    for n, letter in enumerate("rgba"):
+        given = f"sigma_t = {{ texture = 'orm.{ending}', channel = '{letter}' }}"
+        texture = materials.load(write("sigma_t = 0.25", given)).values["sigma_t"]
+        np.testing.assert_allclose(texture.read()[..., 0], PACKED[..., n] / 255, atol=1e-6)
+
+
+def test_the_range_concerns_the_chosen_channel_alone(write, tmp_path):
+    write_image(tmp_path / "orm.png", PACKED)
+    for letter, good in zip("rgba", (False, True, False, True), strict=True):
+        given = f"alpha_bottom = {{ texture = 'orm.png', channel = '{letter}' }}"
+        texture = materials.load(write("alpha_bottom = 0.2", given)).values["alpha_bottom"]
+        if good:
+            texture.read()
+            continue
+        with pytest.raises(TextureError, match="alpha_bottom"):
+            texture.read()
+
+
+def test_a_coloured_image_for_one_number_is_refused_unless_a_channel_is_chosen(write, tmp_path):
+    """Grey ones of three channels need no choice; the message says how to choose."""
+    write_image(tmp_path / "orm.png", PACKED[..., :3].copy())
+    texture = materials.load(write("sigma_t = 0.25", "sigma_t = { texture = 'orm.png' }")).values["sigma_t"]
+    with pytest.raises(
+        TextureError, match=r"orm.png is coloured, .* \{ texture = 'orm.png', channel = 'g' \}"
+    ):
+        texture.read()
+    write_image(tmp_path / "orm.png", np.repeat(PACKED[..., 1:2], 3, axis=2))
+    np.testing.assert_allclose(texture.read()[..., 0], PACKED[..., 1] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("channel = 'x'", "channel is 'x', but must be 'r', 'g', 'b' or 'a'"),
+        ("channel = 1", "channel is 1"),
+        ("channel = 'rg'", "channel is 'rg'"),
+        ("channel = ''", "channel is ''"),
+        ("channel = ['g']", "channel is"),
+    ],
+)
+def test_a_channel_that_is_none_is_refused(write, tmp_path, given, message):
+    write_image(tmp_path / "orm.png", PACKED)
+    with pytest.raises(MaterialError, match=message):
+        materials.load(write("sigma_t = 0.25", f"sigma_t = {{ texture = 'orm.png', {given} }}"))
+    with pytest.raises(MaterialError, match="a channel is for parameters of one number"):
+        materials.load(write("albedo = 0.5", "albedo = { texture = 'orm.png', channel = 'g' }"))
+    write_image(tmp_path / "orm.png", PACKED[..., :3].copy())
+    texture = materials.load(write("sigma_t = 0.25", "sigma_t = { texture = 'orm.png', channel = 'a' }"))
+    with pytest.raises(TextureError, match="no alpha channel"):
+        texture.values["sigma_t"].read()
+
+
+def test_an_image_of_other_channels_is_refused_with_their_names(write, tmp_path):
+    kind = mi.Bitmap.PixelFormat.MultiChannel
+    mi.Bitmap(np.zeros((2, 2, 2), np.float32), kind, ["Z", "ID"]).write(str(tmp_path / "other.exr"))
+    texture = materials.load(write("sigma_t = 0.25", "sigma_t = { texture = 'other.exr' }")).values["sigma_t"]
+    with pytest.raises(TextureError, match="channels Z, ID; wanted are R, G, B"):
+        texture.read()
+
+
+def test_images_repeat_as_often_as_the_file_says(write, tmp_path):
+    """A texture's own `uv_scale` before that of the material, which counts for textures that are added, too."""
+    write_image(tmp_path / "image.png", PACKED)
+    both = "alpha_bottom = { texture = 'image.png', channel = 'g', uv_scale = 2.5 }\nalbedo = { texture = 'image.png' }"
+    path = write("alpha_bottom = 0.2", both)
+    path.write_text(
+        path.read_text().replace("albedo = 0.5", "").replace("[parameters]", "uv_scale = 4\n[parameters]")
+    )
+    material = materials.load(path)
+    assert [t.uv_scale for t in material.textures.values()] == [2.5, 4.0]
+    added = material.changed({"sigma_t": {"texture": str(tmp_path / "image.png"), "channel": "g"}})
+    assert added.textures["sigma_t"].uv_scale == 4.0
+    assert materials.load(write()).uv_scale == 1.0
 
 
 def test_a_textured_material_has_no_vector(write, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -20,8 +21,8 @@ _Set = Annotated[
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="Change a parameter of the material: alpha_top=.2, albedo=.9,.1,.1, conductor=Ag, sigma_t=wear.png. "
-        "May be repeated.",
+        help="Change a parameter of the material: alpha_top=.2, albedo=.9,.1,.1 or #3366ee, conductor=Ag, "
+        "sigma_t=wear.png, alpha_bottom=orm.png,channel=g. May be repeated.",
     ),
 ]
 _AdapterName = Annotated[str, typer.Option(help="A shipped adapter's name or a weights file.")]
@@ -312,7 +313,22 @@ def _change(text: str) -> tuple[str, Any]:
         numbers = [float(part) for part in value.split(",")]
         return name, numbers if len(numbers) > 1 else numbers[0]
     except ValueError:
-        return name, value if name == "conductor" else {"texture": value}
+        return name, value if name == "conductor" or value.startswith("#") else _texture(value)
+
+
+def _texture(text: str) -> dict[str, Any]:
+    """`orm.png,channel=g,uv_scale=4` as a material file's table; what is no option belongs to the file's name."""
+    from nma.materials import TEXTURE_OPTIONS
+
+    file, *parts = re.split(rf",(?=(?:{'|'.join(TEXTURE_OPTIONS)})=)", text)
+    return {"texture": file} | {key: _option(value) for key, _, value in (p.partition("=") for p in parts)}
+
+
+def _option(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return {"true": True, "false": False}.get(text, text)
 
 
 def _assignment(text: str) -> tuple[str, str]:

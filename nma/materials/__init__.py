@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import math
+import os
+import re
+import reprlib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,77 +17,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.data import load_conductors
-from nma.errors import MaterialError, ParamError, TextureError
-from nma.image_io import load_bitmap
+from nma.errors import MaterialError, ParamError, one_line
+from nma.materials.texture import CHANNELS, Texture
 from nma.params import SPACES, Param, ParamSpace
 
 __all__ = ["Material", "Texture", "load", "names"]
 
 FOLDER = Path(__file__).parent
-HEADER = ("title", "description", "class", "parameters")
-TEXTURE_OPTIONS = ("texture", "raw", "scale", "offset")
+HEADER = ("title", "description", "class", "uv_scale", "parameters")
+TEXTURE_OPTIONS = ("texture", "raw", "channel", "scale", "offset", "uv_scale")
+# A material is a page of text; a larger file is something else.
+MAX_BYTES = 1 << 20
 
-
-@dataclass(frozen=True)
-class Texture:
-    """An image that drives `parameter`: its value is offset + scale * pixel.
-
-    Pixels of a `raw` image are the numbers in the file, bytes as 0..1; otherwise 8-bit images are sRGB and
-    made linear.
-    """
-
-    parameter: Param
-    path: Path
-    raw: bool
-    scale: float = 1.0
-    offset: float = 0.0
-
-    def read(self) -> NDArray[np.float32]:
-        """The parameter's values (height, width, size), row 0 at the top of the image.
-
-        Raises `TextureError` if the file cannot be read, or holds values that are not finite or physically
-        invalid.
-        """
-        values = _read_image(self.path, self.parameter.size, self.raw) * np.float32(self.scale)
-        values += np.float32(self.offset)
-        low, high = self.parameter.bounds("valid")
-        slack = 1e-6  # single precision
-        bad = ~((values >= low - slack) & (values <= high + slack)) | ~np.isfinite(values)
-        if bad.any():
-            row, column, channel = np.argwhere(bad)[0]
-            raise TextureError(
-                f"{self.path}: {bad.sum()} of {bad.size} values are not allowed for {self.parameter.name} "
-                f"({low:g} .. {high:g}), the first is {values[row, column, channel]} at x={column}, y={row}"
-            )
-        return np.clip(values, low, high)
-
-
-def _read_image(path: Path, channels: int, raw: bool) -> NDArray[np.float32]:
-    """Pixels (height, width, channels), grey if `channels` is 1, linear unless `raw`."""
-    import mitsuba as mi
-
-    if not path.is_file():
-        raise TextureError(f"texture {path} does not exist")
-    try:
-        bitmap = load_bitmap(path)
-    except RuntimeError as error:
-        raise TextureError(f"texture {path} cannot be read: {str(error).splitlines()[0]}") from error
-    if raw:
-        bitmap.set_srgb_gamma(False)
-    pixels = mi.Bitmap.PixelFormat.Y if channels == 1 else mi.Bitmap.PixelFormat.RGB
-    array = np.array(bitmap.convert(pixels, mi.Struct.Type.Float32, srgb_gamma=False))
-    return array.reshape(*array.shape[:2], channels)
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
 
 @dataclass(frozen=True)
 class Material:
-    """A source material: `values` has a number, an RGB triple or a `Texture` for each parameter of its class."""
+    """A source material: `values` has a number, an RGB triple or a `Texture` for each parameter of its class.
+
+    Textures that `changed` adds lie `uv_scale` times along a unit of uv, unless they say otherwise.
+    """
 
     name: str
     title: str
     description: str
     class_name: str
     values: dict[str, float | tuple[float, ...] | Texture]
+    uv_scale: float = 1.0
 
     @property
     def space(self) -> ParamSpace:
@@ -117,11 +79,12 @@ class Material:
         return Material(name, name.replace("-", " ").capitalize(), "", space.name, values)
 
     def changed(self, given: Mapping[str, Any], where: str | Path = "changes") -> Material:
-        """A copy with some parameters replaced, given as in a file: numbers, lists, `conductor`, textures.
+        """A copy with some parameters replaced, given as in a file: numbers, lists, colours, `conductor`, textures.
 
         Texture paths are relative to the folder of `where`, which errors name. Raises `MaterialError`.
         """
-        return replace(self, values=self.values | _values(given, self.space, Path(where), partial=True))
+        changed = _values(given, self.space, Path(where), self.uv_scale, partial=True)
+        return replace(self, values=self.values | changed)
 
 
 def names() -> tuple[str, ...]:
@@ -138,20 +101,30 @@ def load(name_or_path: str | Path) -> Material:
     """
     if str(name_or_path).endswith(".toml"):
         path = Path(name_or_path)
-        if not path.is_file():
-            raise MaterialError(f"there is no material file {path}")
+        if not os.path.isfile(path):
+            raise MaterialError(f"there is no material file {_short(path)}")
     else:
         path = FOLDER / f"{name_or_path}.toml"
         if str(name_or_path) not in names():
             raise MaterialError(
-                f"there is no material '{name_or_path}'{_suggestion(str(name_or_path), names())}; "
+                f"there is no material '{_short(name_or_path)}'{_suggestion(str(name_or_path), names())}; "
                 "`nma materials` lists all of them, and a file's name must end in .toml"
             )
+    return _parse(_document(path), path)
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    """The content of a TOML file."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise MaterialError(f"{path} is no TOML file: {error}") from error
-    return _parse(document, path)
+        if path.stat().st_size > MAX_BYTES:
+            raise MaterialError(f"{path}: more than {MAX_BYTES:,} bytes are no material file")
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise MaterialError(f"{path}: cannot be read: {error.strerror}") from error
+    except RecursionError:
+        raise MaterialError(f"{path} is no material file: its lists or tables nest too deep") from None
+    except ValueError as error:  # of TOML, of UTF-8, or of a number that has too many digits
+        raise MaterialError(f"{path} is no TOML file: {one_line(str(error))}") from error
 
 
 def _parse(document: Mapping[str, Any], path: Path) -> Material:
@@ -159,24 +132,30 @@ def _parse(document: Mapping[str, Any], path: Path) -> Material:
     for key in ("title", "class", "parameters"):
         if key not in document:
             raise MaterialError(f"{path}: '{key}' is missing; a file has {', '.join(HEADER)}")
+    for key in ("title", "description", "class"):
+        if not isinstance(document.get(key, ""), str):
+            raise MaterialError(f"{path}: {key} is {_shown(document[key])}, but must be text in quotes")
     class_name = document["class"]
     if class_name not in SPACES:
-        raise MaterialError(f"{path}: there is no class '{class_name}'; there is {', '.join(SPACES)}")
+        raise MaterialError(f"{path}: there is no class {_shown(class_name)}; there is {', '.join(SPACES)}")
     if not isinstance(document["parameters"], Mapping):
         raise MaterialError(f"{path}: 'parameters' must be a table: [parameters], then one line each")
-    values = _values(document["parameters"], SPACES[class_name], path)
-    title, description = str(document["title"]), str(document.get("description", ""))
-    return Material(path.stem, title, description, class_name, values)
+    uv_scale = _uv_scale(document, 1.0, str(path))
+    values = _values(document["parameters"], SPACES[class_name], path, uv_scale)
+    title, description = (" ".join(document.get(key, "").split()) for key in ("title", "description"))
+    return Material(path.stem, title, description, class_name, values, uv_scale)
 
 
-def _values(given: Mapping[str, Any], space: ParamSpace, path: Path, partial: bool = False) -> dict[str, Any]:
+def _values(
+    given: Mapping[str, Any], space: ParamSpace, path: Path, uv_scale: float, partial: bool = False
+) -> dict[str, Any]:
     """One checked value per parameter of the class, in its order; only those given if `partial`."""
     given = _with_indices(given, path)
     known = [param.name for param in space.params]
     _refuse_unknown(given, (*known, "conductor"), f"{path}, [parameters]")
     if not partial and (missing := [name for name in known if name not in given]):
         raise MaterialError(f"{path}, [parameters]: {', '.join(missing)} missing")
-    values = {p.name: _value(given[p.name], p, path) for p in space.params if p.name in given}
+    values = {p.name: _value(given[p.name], p, path, uv_scale) for p in space.params if p.name in given}
 
     # Textures are checked when they are read; any allowed number stands in for them here, and for what is not given.
     numbers: dict[str, Any] = {param.name: param.low for param in space.params}
@@ -198,56 +177,126 @@ def _with_indices(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
     name, metals = values.pop("conductor"), load_conductors()
     if name not in metals.names:
         raise MaterialError(
-            f"{path}: there is no conductor '{name}'{_suggestion(str(name), metals.names)}; "
+            f"{path}: there is no conductor {_shown(name)}{_suggestion(name, metals.names)}; "
             f"there is {', '.join(metals.names)}"
         )
     row = metals.names.index(name)
     return values | {"eta_conductor": metals.eta[row].tolist(), "k_conductor": metals.k[row].tolist()}
 
 
-def _value(given: Any, param: Param, path: Path) -> float | tuple[float, ...] | Texture:
-    """A number, a triple, or a texture; a number for a triple means grey."""
+def _value(given: Any, param: Param, path: Path, uv_scale: float) -> float | tuple[float, ...] | Texture:
+    """A number, a triple, a colour's hexadecimal digits, or a texture; a number for a triple means grey."""
     if isinstance(given, Mapping):
-        return _texture(given, param, path)
+        return _texture(given, param, path, uv_scale)
+    if isinstance(given, str) and given.startswith("#"):
+        return _colour(given, param, path)
     numbers = given if isinstance(given, list) else [given] * param.size
     if len(numbers) != param.size or not all(_is_number(x) for x in numbers):
         kind = "a number" if param.size == 1 else f"a number or a list of {param.size}"
+        kind += ", a colour '#3366ee'" if _is_colour(param) else ""
         raise MaterialError(
-            f"{path}: {param.name} is {given!r}, but must be {kind} or {{ texture = 'FILE' }}"
+            f"{path}: {param.name} is {_shown(given)}, but must be {kind} or {{ texture = 'FILE' }}"
         )
-    return float(numbers[0]) if param.size == 1 else tuple(float(x) for x in numbers)
+    return _float(numbers[0]) if param.size == 1 else tuple(_float(x) for x in numbers)
 
 
-def _texture(given: Mapping[str, Any], param: Param, path: Path) -> Texture:
+def _colour(given: str, param: Param, path: Path) -> tuple[float, ...]:
+    """A colour of sRGB in hexadecimal digits, made linear (IEC 61966-2-1)."""
+    if not _is_colour(param):
+        raise MaterialError(
+            f"{path}: {param.name} is no colour, so {_shown(given)} means nothing; give numbers"
+        )
+    if not re.fullmatch("#[0-9a-fA-F]{6}", given):
+        raise MaterialError(f"{path}: {param.name} is {_shown(given)}; a colour has six digits, as '#3366ee'")
+    srgb = [int(given[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+    return tuple(x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in srgb)
+
+
+def _is_colour(param: Param) -> bool:
+    """Whether the parameter is a share of light per channel, which people pick and paint in sRGB."""
+    return param.size == 3 and param.bounds("valid") == (0.0, 1.0)
+
+
+def _texture(given: Mapping[str, Any], param: Param, path: Path, uv_scale: float) -> Texture:
     where = f"{path}, {param.name}"
     _refuse_unknown(given, TEXTURE_OPTIONS, where)
     if not isinstance(given.get("texture"), str):
         raise MaterialError(f"{where}: texture must be a file name, relative to the material's file")
     if not isinstance(given.get("raw", True), bool):
         raise MaterialError(f"{where}: raw must be true or false")
-    scale, offset = given.get("scale", 1.0), given.get("offset", 0.0)
-    if not (_is_number(scale) and _is_number(offset)):
-        raise MaterialError(f"{where}: scale and offset must be numbers")
-    image = (path.parent / given["texture"]).resolve()
-    if not image.is_file():
-        raise MaterialError(f"{where}: there is no texture {image}")
+    scale, offset = (
+        _option(given, key, default, where) for key, default in (("scale", 1.0), ("offset", 0.0))
+    )
+    image = path.parent / given["texture"]
+    if not os.path.isfile(image):
+        raise MaterialError(f"{where}: there is no texture {_short(image)}")
     # Colours are painted in sRGB, everything else is a number.
-    raw = given.get("raw", param.name != "albedo")
-    return Texture(param, image, raw, float(scale), float(offset))
+    raw, channel = given.get("raw", not _is_colour(param)), _channel(given, param, where)
+    return Texture(param, image.resolve(), raw, scale, offset, channel, _uv_scale(given, uv_scale, where))
+
+
+def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
+    """The channel that is chosen for a parameter of one number."""
+    channel = given.get("channel")
+    if channel is None:
+        return None
+    if not (isinstance(channel, str) and len(channel) == 1 and channel in CHANNELS):
+        raise MaterialError(f"{where}: channel is {_shown(channel)}, but must be 'r', 'g', 'b' or 'a'")
+    if param.size > 1:
+        raise MaterialError(f"{where}: a channel is for parameters of one number, this one has {param.size}")
+    return channel
+
+
+def _uv_scale(given: Mapping[str, Any], default: float, where: str) -> float:
+    """How often images lie along a unit of uv."""
+    uv_scale = _option(given, "uv_scale", default, where)
+    if not uv_scale > 0:
+        raise MaterialError(f"{where}: uv_scale is {uv_scale:g}, but must be above 0")
+    return uv_scale
+
+
+def _option(given: Mapping[str, Any], key: str, default: float, where: str) -> float:
+    """A number of single precision."""
+    value = given.get(key, default)
+    if not (_is_number(value) and abs(_float(value)) < 1e38):
+        raise MaterialError(f"{where}: {key} is {_shown(value)}, but must be a finite number")
+    return _float(value)
 
 
 def _is_number(x: Any) -> bool:
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 
+def _float(x: float) -> float:
+    """The number as a float; integers have no bound in TOML."""
+    try:
+        return float(x)
+    except OverflowError:
+        return math.inf if x > 0 else -math.inf
+
+
+def _shown(given: Any) -> str:
+    """A value of a file in an error: short, on one line."""
+    try:
+        return _REPR.repr(given)
+    except ValueError:
+        return "a number of too many digits"
+
+
+def _short(name: object) -> str:
+    """A name in an error: short, on one line."""
+    text = repr(str(name))[1:-1]
+    return text if len(text) <= 300 else f"{text[:100]}..."
+
+
 def _refuse_unknown(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
     for key in given:
         if key not in known:
             raise MaterialError(
-                f"{where}: unknown key '{key}'{_suggestion(key, known)}; known are {', '.join(known)}"
+                f"{where}: unknown key {_shown(key)}{_suggestion(key, known)}; known are {', '.join(known)}"
             )
 
 
-def _suggestion(given: str, known: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
+def _suggestion(given: Any, known: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(_short(given) if isinstance(given, str) else "", known, n=1, cutoff=0.5)
     return f" (did you mean '{close[0]}'?)" if close else ""

@@ -201,7 +201,9 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     if material.class_name != space.name:
         raise ParamError(f"material '{name}' is of class {material.class_name}, wanted is {space.name}")
     return {
-        key: mi.load_dict(bitmap_texture(value.read())) if isinstance(value, materials.Texture) else value
+        key: mi.load_dict(bitmap_texture(value.read(), scale=value.uv_scale))
+        if isinstance(value, materials.Texture)
+        else value
         for key, value in material.values.items()
     }
 

@@ -82,5 +82,5 @@ def load_scene(
 
 def _value(value: float | tuple[float, ...] | Texture) -> Any:
     if isinstance(value, Texture):
-        return bitmap_texture(value.read())
+        return bitmap_texture(value.read(), scale=value.uv_scale)
     return {"type": "rgb", "value": list(value)} if isinstance(value, tuple) else value

@@ -1,0 +1,106 @@
+"""Images that drive parameters of materials."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.errors import TextureError, one_line
+from nma.image_io import ImageError, coloured_layer, load_bitmap
+from nma.params import Param
+
+# The channels of an image, by which one of them is chosen for a parameter of one number.
+CHANNELS = "rgba"
+# What a grey pixel's channels may differ by, for pixels up to 1: rounding.
+_GREY = 1e-6
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image that drives `parameter`: its value is offset + scale * pixel.
+
+    Pixels of a `raw` image are the numbers in the file, bytes as 0..1; otherwise 8-bit images are sRGB and
+    made linear. A parameter of one number wants a grey image, or one of the `CHANNELS` of any. The image lies
+    `uv_scale` times along a unit of uv.
+    """
+
+    parameter: Param
+    path: Path
+    raw: bool
+    scale: float = 1.0
+    offset: float = 0.0
+    channel: str | None = None
+    uv_scale: float = 1.0
+
+    def read(self) -> NDArray[np.float32]:
+        """The parameter's values (height, width, size), row 0 at the top of the image.
+
+        Raises `TextureError` if the file cannot be read, is coloured where a channel must be chosen, or holds values
+        that are not finite or physically invalid.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+            values = self._pixels() * np.float32(self.scale) + np.float32(self.offset)
+        low, high = self.parameter.bounds("valid")
+        slack = 1e-6  # single precision
+        bad = ~((values >= low - slack) & (values <= high + slack)) | ~np.isfinite(values)
+        if bad.any():
+            row, column, channel = np.argwhere(bad)[0]
+            raise TextureError(
+                f"{self.path}: {bad.sum()} of {bad.size} values are not allowed for {self.parameter.name} "
+                f"({low:g} .. {high:g}), the first is {values[row, column, channel]} at x={column}, y={row}"
+            )
+        return np.clip(values, low, high)
+
+    def _pixels(self) -> NDArray[np.float32]:
+        """The image (height, width, size), linear unless `raw`, grey where `size` is 1."""
+        import mitsuba as mi
+
+        bitmap = _bitmap(self.path)
+        if self.channel == "a" and "A" not in [field.name for field in bitmap.struct_()]:
+            raise TextureError(
+                f"texture {self.path} has no alpha channel to choose for {self.parameter.name}"
+            )
+        if self.raw:
+            bitmap.set_srgb_gamma(False)
+        rgba = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, srgb_gamma=False))
+        if self.parameter.size == 3:
+            return rgba[..., :3]
+        if self.channel is None and _is_coloured(rgba[..., :3]):
+            raise TextureError(
+                f"texture {self.path} is coloured, {self.parameter.name} is one number: "
+                f"choose a channel, {{ texture = '{self.path.name}', channel = 'g' }} ('r', 'g', 'b' or 'a')"
+            )
+        first = CHANNELS.index(self.channel or "r")
+        return rgba[..., first : first + 1]
+
+
+def _bitmap(path: Path) -> Any:
+    """The image, or its layer in colour where it has several."""
+    import mitsuba as mi
+
+    if not os.path.isfile(path):
+        raise TextureError(f"texture {path} does not exist")
+    try:
+        bitmap = load_bitmap(path)
+        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+            bitmap = coloured_layer(bitmap)
+    except RuntimeError as error:
+        raise TextureError(f"texture {path} cannot be read: {one_line(str(error))}") from error
+    except ImageError as error:
+        raise TextureError(str(error)) from error
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        names = ", ".join(field.name for field in bitmap.struct_())
+        raise TextureError(f"texture {path} has the channels {names}; wanted are R, G, B (and A), or Y")
+    return bitmap
+
+
+def _is_coloured(rgb: NDArray[np.float32]) -> bool:
+    """Whether the channels differ anywhere by more than rounding."""
+    with np.errstate(invalid="ignore"):
+        spread = np.ptp(rgb, axis=-1)
+    return bool((spread > _GREY * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())
