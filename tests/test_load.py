@@ -1,5 +1,7 @@
 """Loading of scenes and materials into Mitsuba, and rendering in passes."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -88,6 +90,23 @@ def test_a_material_becomes_a_dictionary_of_either_model():
     assert reference["albedo"] == {"type": "rgb", "value": [0.95, 0.08, 0.03]}
     with pytest.raises(ParamError, match="unknown model"):
         material_bsdf(material, "principled")
+
+
+@pytest.mark.parametrize("model", ["nma", "layered"])
+def test_images_of_a_material_repeat_as_often_as_it_says(model, tmp_path):
+    """By the file's name in a scene, and by its dictionary: three times along uv."""
+    pixels = np.zeros((1, 8, 3), np.uint8)
+    pixels[:, 2:4, 0] = 255
+    Image.fromarray(pixels).save(tmp_path / "image.png")
+    text = (materials.FOLDER / "wet-nickel.toml").read_text()
+    image = "sigma_t = { texture = 'image.png', channel = 'r', uv_scale = 3 }"
+    (tmp_path / "mine.toml").write_text(text.replace("sigma_t = 0.0", image))
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.uv = mi.Point2f([0.125, 0.375, 0.125 + 1 / 3], 0.5)
+    by_name = {"type": model, "material": str(tmp_path / "mine.toml")}
+    for description in (by_name, material_bsdf(materials.load(tmp_path / "mine.toml"), model)):
+        sigma_t = load_dict(description).inputs.columns(si)[-1]
+        np.testing.assert_allclose(sigma_t, [1.0, 0.0, 1.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("model", ["nma", "layered"])

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -37,12 +38,12 @@ def progress(unit: str) -> Progress:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None) -> Table:
-    """A table whose first column is text and whose others are aligned to the right."""
-    result = Table(title=title)
+    """A table whose first column is text and whose others are aligned to the right; brackets are no markup in it."""
+    result = Table(title=escape(title) if title else None)
     for n, heading in enumerate(headings):
         result.add_column(heading, justify="left" if n == 0 else "right", overflow="fold")
     for row in rows:
-        result.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row))
+        result.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else escape(str(cell)) for cell in row))
     return result
 
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
 from nma.cli import console
 from nma.errors import TableError
+
+if TYPE_CHECKING:
+    from nma.materials import Material, Texture
 
 
 def register(app: typer.Typer) -> None:
@@ -21,16 +26,30 @@ def register(app: typer.Typer) -> None:
 
 
 def materials(
-    name: Annotated[str | None, typer.Argument(help="Show this material's parameters.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Show this material's parameters, or those of a material file (.toml)."),
+    ] = None,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print JSON on stdout and nothing else there: all digits, for programs."),
+    ] = False,
 ) -> None:
     """List the named materials, or show one of them."""
     from nma import materials as library
 
     if name is None:
-        listed = [(m.name, m.title, m.description) for m in map(library.load, library.names())]
+        known = [library.load(n) for n in library.names()]
+        if as_json:
+            print(json.dumps([_facts(m) for m in known]))
+            return
+        listed = [(m.name, m.title, m.description) for m in known]
         console.out.print(console.table(("name", "title", "description"), listed))
         return
     material = library.load(name)
+    if as_json:
+        print(json.dumps(_facts(material)))
+        return
     rows = [
         (p.name, p.symbol, f"{p.low:g} .. {p.high:g}", _show(material.values[p.name]))
         for p in material.space.params
@@ -137,7 +156,25 @@ def _vectors(space, params, material, draw, population, seed):
     return space.sample(np.random.default_rng(seed), draw, population)
 
 
-def _show(value: object) -> str:
+def _facts(material: Material) -> dict[str, Any]:
+    """A material for other programs: its vector in the order of the class, null where images drive it, and by name."""
+    values = {
+        name: {**asdict(value), "parameter": name, "path": str(value.path)}
+        if name in material.textures
+        else value
+        for name, value in material.values.items()
+    }
+    return {
+        "name": material.name,
+        "title": material.title,
+        "description": material.description,
+        "class": material.class_name,
+        "parameters": None if material.textures else material.vector().tolist(),
+        "values": values,
+    }
+
+
+def _show(value: float | tuple[float, ...] | Texture) -> str:
     if isinstance(value, tuple):
         return ", ".join(f"{x:.4g}" for x in value)
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else value.path.name
