@@ -6,15 +6,16 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from nma import sources
-from nma.errors import SourceError, TableError
+from nma.errors import SourceError
 from nma.sources import nbrdf
 from nma.sources.base import Values
-from nma.table import Tables
+from nma.table import Tables, kept
 from nma.tabulation import tabulate_values
 
 # What is in the name of a table beside the material's, so that a table of another file is not taken for its own.
@@ -83,8 +84,8 @@ def tables(
     for number, member in enumerate(chosen):
         if member.path not in digests:
             digests[member.path] = _digest(member.path)
-        kept = Path(folder) / f"{member.name}-{digests[member.path]}.npz"
-        made.append(_kept(kept) or _made(member, kept))
+        file = Path(folder) / f"{member.name}-{digests[member.path]}.npz"
+        made.append(kept(file, partial(_table, member)))
         progress(number + 1)
     both = Tables.concatenate(made)
     return Tables(np.arange(len(made), dtype=np.float64)[:, None], both.values, both.walks, both.error)
@@ -98,15 +99,5 @@ def _digest(path: Path) -> str:
         raise SourceError(f"{path}: cannot be read: {e.strerror}") from None
 
 
-def _kept(path: Path) -> Tables | None:
-    """A table that an earlier run has made; none if it is missing or damaged."""
-    try:
-        return Tables.load(path) if path.exists() else None
-    except TableError:
-        return None
-
-
-def _made(member: Member, path: Path) -> Tables:
-    table = tabulate_values(member.read())
-    table.save(path)
-    return table
+def _table(member: Member) -> Tables:
+    return tabulate_values(member.read())

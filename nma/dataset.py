@@ -93,7 +93,7 @@ class Dataset:
     def create(path: str | Path, settings: Settings) -> Dataset:
         """Opens the dataset at `path` if it was made with the same settings, or creates it. Raises `DatasetError`."""
         path = Path(path)
-        if not (path / "zarr.json").exists():
+        if not os.path.exists(path / "zarr.json"):
             _create_array(path, settings)
         found = Dataset.open(path)
         if found.settings != settings:

@@ -35,6 +35,10 @@ class TableError(NmaError, ValueError):
     """A table or reference file (.npz) is damaged or has the wrong shape."""
 
 
+class OutputError(NmaError, OSError):
+    """A file cannot be written: a full disk, a folder in its place, no permission."""
+
+
 class MissingDependencyError(NmaError, ImportError):
     """A library this feature needs is missing or too old."""
 

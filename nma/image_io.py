@@ -1,10 +1,8 @@
-"""Images on disk: EXR for linear values, PNG for looking at. Every write is atomic: a temporary file, then a rename."""
+"""Images on disk: EXR for linear values, PNG for looking at. Files are written whole or not at all."""
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma.errors import NmaError
+from nma.files import whole, write_bytes
 
 
 class ImageError(NmaError, ValueError):
@@ -76,7 +75,9 @@ def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shou
     array = np.asarray(image)
     if array.dtype != np.uint8:
         array = to_8bit(tonemap(as_image(array, str(path)), exposure=exposure, shoulder=shoulder))
-    return _write_atomically(path, lambda temporary: Image.fromarray(array).save(temporary, format="PNG"))
+    with whole(path) as file:
+        Image.fromarray(array).save(file, format="PNG")
+    return Path(path)
 
 
 def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) -> Path:
@@ -92,8 +93,11 @@ def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) 
         raise ImageError(f"{path}: cannot write an array of shape {array.shape} as an image")
     kind = mi.Bitmap.PixelFormat.MultiChannel if channels else None
     bitmap = mi.Bitmap(array, kind, list(channels))
+    content = mi.MemoryStream()
     with _second_thread():
-        return _write_atomically(path, lambda temporary: bitmap.write(str(temporary)))
+        bitmap.write(content, mi.Bitmap.FileFormat.OpenEXR)
+    write_bytes(path, content.raw_buffer())
+    return Path(path)
 
 
 def load_bitmap(path: str | Path) -> Any:
@@ -146,19 +150,3 @@ def coloured_layer(bitmap: Any) -> Any:
 
     formats = (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA)
     return next((layer for _, layer in bitmap.split() if layer.pixel_format() in formats), bitmap)
-
-
-def _write_atomically(path: str | Path, write: Callable[[Path], object]) -> Path:
-    """Run `write` on a temporary file in the target's folder, then rename it; nothing is left behind on failure."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        write(temporary)
-        temporary.chmod(0o644)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return target

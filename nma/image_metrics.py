@@ -128,6 +128,12 @@ def _pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
     return a, b
 
 
+def ensure_libraries() -> None:
+    """Raises `MissingDependencyError` unless all that metrics need is there: better before an hour of rendering."""
+    for name in ("flip_evaluator", "skimage.metrics"):
+        _library(name)
+
+
 def _library(name: str) -> Any:
     """A library of the extra `compare`.
 

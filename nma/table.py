@@ -9,8 +9,8 @@ bin [1/sr].
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import ops
-from nma.errors import TableError
+from nma.errors import OutputError, TableError
+from nma.files import whole
 from nma.jit import dr
 from nma.ops import Vec3
 from nma.sources.base import Source, Walk
@@ -109,15 +110,11 @@ class Tables:
 
     def save(self, path: str | Path) -> None:
         """Writes the reference-file format of CONVENTIONS.md, atomically."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         arrays: dict[str, Any] = {"params": self.params, "table": self.values, "walks": self.walks}
         if self.error is not None:
             arrays["error"] = self.error
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        with partial.open("wb") as f:
+        with whole(path) as partial, partial.open("wb") as f:
             np.savez_compressed(f, **arrays)
-        partial.replace(path)
 
     @staticmethod
     def load(path: str | Path) -> Tables:
@@ -138,6 +135,24 @@ class Tables:
         _check_arrays(path, params, values, walks, error)
         walks = np.broadcast_to(walks, len(params)).astype(np.int64)
         return Tables(params.astype(np.float64), values, walks, error)
+
+
+def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | None = None) -> Tables:
+    """The tables that an earlier run left in a file, or those of `make`, which are left there for a later one.
+
+    A damaged file is made anew, and so is one of other `params`, if those are given.
+    """
+    with suppress(TableError):
+        found = Tables.load(path)
+        if params is None or np.array_equal(found.params, params):
+            return found
+    made = make()
+    try:
+        made.save(path)
+    except OutputError:
+        # Another run for the same output may have ended and taken the folder away.
+        made.save(path)
+    return made
 
 
 def _check_arrays(

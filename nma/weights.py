@@ -7,7 +7,6 @@ more. The header's metadata has one entry, `nma`, a JSON object with the fields 
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -19,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from nma.errors import WeightsError
+from nma.files import write_bytes
 from nma.network import Layers
 from nma.params import SPACES, ParamSpace
 
@@ -65,11 +65,7 @@ def write(
     for number, (matrix, bias) in enumerate(layers):
         tensors[f"layer{number}.weight"] = np.ascontiguousarray(matrix, np.float32)
         tensors[f"layer{number}.bias"] = np.ascontiguousarray(bias, np.float32)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_bytes(save(tensors, metadata={"nma": json.dumps(asdict(header))}))
-    partial.replace(path)
+    write_bytes(path, save(tensors, metadata={"nma": json.dumps(asdict(header))}))
 
 
 def read(path: str | Path) -> tuple[Header, Layers]:

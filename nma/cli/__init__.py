@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
+import nma
 from nma.cli import data, datasets, learn, library, native, principled, system, view
 from nma.errors import NmaError
 
+
+class _Commands(TyperGroup):
+    """Ctrl-C ends with a message: typer would end without."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            _interrupted()
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="rich",
@@ -27,15 +43,55 @@ for group in (data, datasets, learn, library, principled, view, native, system):
     group.register(app)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"nma {nma.__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
 def main() -> None:
     """Entry point of the `nma` command: expected errors become one line on stderr and exit status 1."""
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except NmaError as e:
-        print(f"nma: {e}", file=sys.stderr)
+        _fail(str(e))
+    except BrokenPipeError:
+        _close_stdout()
         sys.exit(1)
+    except OSError as e:
+        _close_stdout()
+        _fail(f"{e.filename}: {e.strerror}" if e.filename else str(e))
+    except MemoryError as e:
+        _fail(f"out of memory ({e}); ask for less at a time: fewer pixels, materials or points")
     except KeyboardInterrupt:
-        print(
-            "nma: interrupted; run the same command again to go on where it can be resumed", file=sys.stderr
-        )
-        sys.exit(130)
+        _interrupted()
+
+
+def _fail(message: str) -> NoReturn:
+    print(f"nma: {message}", file=sys.stderr)
+    sys.exit(1)
+
+
+def _interrupted() -> NoReturn:
+    print("nma: interrupted; run the same command again to go on where it can be resumed", file=sys.stderr)
+    sys.exit(130)
+
+
+def _close_stdout() -> None:
+    """Where stdout takes no more, a pipe whose reader is gone or a full disk, Python would complain at its end too."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -45,6 +46,11 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str 
     for row in rows:
         result.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else escape(str(cell)) for cell in row))
     return result
+
+
+def loss_plot(output: Path) -> Path:
+    """Where the losses of a training run are drawn: beside its weights."""
+    return output.with_suffix(".loss.png")
 
 
 class TrainingBar:

@@ -6,17 +6,21 @@ import json
 import shutil
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
-from nma.cli import console
+from nma import files
+from nma.cli import console, options
 from nma.errors import TableError
 
 if TYPE_CHECKING:
     from nma.materials import Material, Texture
+    from nma.table import Tables
 
 
 def register(app: typer.Typer) -> None:
@@ -69,7 +73,7 @@ def simulate(
     material: Annotated[
         list[str] | None, typer.Option(help="A named material or material file; may be repeated.")
     ] = None,
-    draw: Annotated[int, typer.Option(help="Draw this many materials at random instead.")] = 0,
+    draw: Annotated[int, options.number("Draw this many materials at random instead.", 0, 100_000)] = 0,
     population: Annotated[
         str,
         typer.Option(
@@ -79,49 +83,55 @@ def simulate(
     class_name: Annotated[
         str, typer.Option("--class", help="The class of the source materials.")
     ] = "layered3",
-    walks: Annotated[int, typer.Option(help="Random walks per material.")] = 16_000_000,
-    seed: Annotated[int, typer.Option(help="Seed of the walks and of the drawn materials.")] = 0,
+    walks: Annotated[int, options.walks("Random walks per material.")] = 16_000_000,
+    seed: Annotated[int, options.seed("Seed of the walks and of the drawn materials.")] = 0,
 ) -> None:
     """Simulate materials and write their tables with standard errors: a reference file.
 
     Example: [bold]nma simulate --material gold-red-lacquer --walks 128000000 -o gold.npz[/bold]
     """
     from nma import sources
-    from nma.table import Tables, stream_keys, tabulate
+    from nma.table import Tables, kept, stream_keys, tabulate
 
-    source = sources.get(class_name)
-    vectors = _vectors(source.space, params, material, draw, population, seed)
     # Finished materials wait beside the output, so that a killed run goes on where it stopped.
     parts = output.with_name(output.name + ".parts")
-    parts.mkdir(parents=True, exist_ok=True)
+    files.try_file(output)
+    files.try_folder(parts)
+    source = sources.get(class_name)
+    vectors = _vectors(source.space, params, material, draw, population, seed)
+    tables: list[Tables] = []
+    walked = 0
+
+    def walk(vector: NDArray[np.float64], key: np.uint64) -> Tables:
+        nonlocal walked
+        walked += walks
+        return tabulate(source, vector[None], walks, np.array([key]))
+
     with console.progress("Mwalks/s") as bar:
         task = bar.add_task("simulating", total=len(vectors), rate="", note="")
-        began, simulated = time.perf_counter(), 0
-        for n, vector in enumerate(vectors):
-            part = parts / f"{stream_keys(seed, [n])[0]:016x}-{walks}.npz"
-            if not (part.exists() and np.array_equal(Tables.load(part).params[0], vector)):
-                tabulate(source, vector[None], walks, stream_keys(seed, [n])).save(part)
-                simulated += 1
-            rate = simulated * walks / (time.perf_counter() - began) / 1e6
-            bar.update(task, completed=n + 1, rate=f"{rate:.1f}")
-    Tables.concatenate(
-        [Tables.load(parts / f"{key:016x}-{walks}.npz") for key in stream_keys(seed, range(len(vectors)))]
-    ).save(output)
-    shutil.rmtree(parts)
+        began = time.perf_counter()
+        for vector, key in zip(vectors, stream_keys(seed, range(len(vectors))), strict=True):
+            part = parts / f"{key:016x}-{walks}.npz"
+            tables.append(kept(part, partial(walk, vector, key), vector[None]))
+            rate = walked / (time.perf_counter() - began) / 1e6
+            bar.update(task, completed=len(tables), rate=f"{rate:.1f}")
+    Tables.concatenate(tables).save(output)
+    shutil.rmtree(parts, ignore_errors=True)
     console.err.print(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
 
 
 def dataset(
     class_name: Annotated[str, typer.Argument(help="The class to sample, layered3.")],
     output: Annotated[Path, typer.Argument(help="The dataset (.zarr folder) to create or complete.")],
-    materials: Annotated[int, typer.Option(help="Number of materials.")] = 8000,
-    walks: Annotated[int, typer.Option(help="Random walks per material.")] = 819_200,
-    seed: Annotated[int, typer.Option(help="Seed; equal seeds give equal datasets.")] = 0,
+    materials: Annotated[int, options.number("Number of materials.", 1, 10**6)] = 8000,
+    walks: Annotated[int, options.walks("Random walks per material.")] = 819_200,
+    seed: Annotated[int, options.seed("Equal seeds give equal datasets.")] = 0,
     population: Annotated[str, typer.Option(help="mixed, range, metals or held_out_metals.")] = "mixed",
 ) -> None:
     """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
     from nma.dataset import Dataset, Settings
 
+    files.try_folder(output)
     data = Dataset.create(output, Settings(class_name, materials, walks, seed, population))  # type: ignore[arg-type]
     before = materials - len(data.missing())
     with console.progress("Mwalks/s") as bar:

@@ -12,14 +12,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from nma.cli import console
+from nma import files
+from nma.cli import console, options
 from nma.params import LAYERED3
 
-_Steps = Annotated[int | None, typer.Option(help="Number of optimisation steps.")]
-_Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.")]
-_Seed = Annotated[int | None, typer.Option(help="Seed of the weights and of the batches.")]
-_Rate = Annotated[float | None, typer.Option(help="Learning rate (its peak under the onecycle schedule).")]
-_Points = Annotated[int | None, typer.Option(help="Points per bin of the AvA estimate (eq. 6).")]
+_Seed = Annotated[int, options.seed("Seed of the weights, of the batches and of a simulated table.")]
+_Points = Annotated[int | None, options.number("Points per bin of the AvA estimate (eq. 6).", 1, 4096)]
 _PointsLaw = Annotated[
     str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")
 ]
@@ -31,9 +29,9 @@ _Target = Annotated[
     ),
 ]
 _Albedo = Annotated[
-    float | None, typer.Option(help="Weight of the error of the directional albedo; 0: none.")
+    float | None, options.number("Weight of the error of the directional albedo; 0: none.", 0, 1e6)
 ]
-_Finest = Annotated[float | None, typer.Option(help="Microfacet width down to which points crowd.")]
+_Finest = Annotated[float | None, options.number("Microfacet width down to which points crowd.", 1e-6, 1)]
 _Loss = Annotated[str | None, typer.Option(help="huber, or log (the paper's eq. 7).")]
 
 
@@ -49,29 +47,33 @@ def train(
     data: Annotated[Path | None, typer.Option(help="A dataset made by `nma dataset`.")] = None,
     stream: Annotated[
         int,
-        typer.Option(
-            help="Without a dataset: keep this many fresh materials in memory, replaced as training goes on."
+        options.number(
+            "Without a dataset: keep this many fresh materials in memory, replaced as training goes on.",
+            0,
+            100_000,
         ),
     ] = 0,
-    walks: Annotated[int, typer.Option(help="Walks per streamed material.")] = 819_200,
-    refresh: Annotated[int, typer.Option(help="Steps between two exchanges of streamed materials.")] = 400,
+    walks: Annotated[int, options.walks("Walks per streamed material.")] = 819_200,
+    refresh: Annotated[
+        int, options.number("Steps between two exchanges of streamed materials.", 1, 10**9)
+    ] = 400,
     preset: Annotated[str, typer.Option(help="class, or paper for the paper's recipe.")] = "class",
     variant: Annotated[
         str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
     ] = "blended+omega_i",
     instances: Annotated[
-        int | None, typer.Option(help="Principled instances in the blend (1 to 5), instead of the variant's.")
+        int | None, options.number("Principled instances in the blend, instead of the variant's.", 1, 5)
     ] = None,
-    network: _Network = None,
+    network: options.Network = None,
     target: _Target = None,
-    steps: _Steps = None,
+    steps: options.Steps = None,
     points: _Points = None,
     points_law: _PointsLaw = None,
     finest: _Finest = None,
     loss: _Loss = None,
     albedo: _Albedo = None,
-    learning_rate: _Rate = None,
-    seed: _Seed = None,
+    learning_rate: options.Rate = None,
+    seed: _Seed = 0,
 ) -> None:
     """Train an adapter for a whole class. A killed run goes on from its checkpoint (OUTPUT.ckpt).
 
@@ -81,6 +83,8 @@ def train(
     from nma.train import recipe as recipes
     from nma.train import run as training
 
+    checkpoint = output.with_name(output.name + ".ckpt")
+    files.try_file(output, checkpoint, console.loss_plot(output))
     lobes, directional = _variant(variant)
     recipe = recipes.preset(
         preset,
@@ -99,8 +103,6 @@ def train(
     )
     space = sources.get(class_name).space
     source, record = _training_data(class_name, data, stream, walks, recipe.seed)
-    checkpoint = output.with_name(output.name + ".ckpt")
-    output.parent.mkdir(parents=True, exist_ok=True)
     with console.TrainingBar(recipe) as bar:
         adapter, run = training.train_class(
             space, recipe, source, record, checkpoint=checkpoint, refresh=refresh, progress=bar.update
@@ -124,20 +126,20 @@ def fit(
             help="Which material of a file that holds several: a name, or a number in a reference file."
         ),
     ] = None,
-    walks: Annotated[int, typer.Option(help="Walks of the table of a simulated material.")] = 64_000_000,
+    walks: Annotated[int, options.walks("Walks of the table of a simulated material.")] = 64_000_000,
     variant: Annotated[
         str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
     ] = "blended+omega_i",
-    network: _Network = None,
+    network: options.Network = None,
     target: _Target = None,
-    steps: _Steps = None,
+    steps: options.Steps = None,
     points: _Points = None,
     points_law: _PointsLaw = None,
     finest: _Finest = None,
     loss: _Loss = None,
     albedo: _Albedo = None,
-    learning_rate: _Rate = None,
-    seed: _Seed = None,
+    learning_rate: options.Rate = None,
+    seed: _Seed = 0,
 ) -> None:
     """Overfit one material: train a small network on its values, or on its table. See docs/bring-your-own.md.
 
@@ -150,7 +152,8 @@ def fit(
     from nma.train.fit import fit as fit_one
     from nma.train.fit import recipe_for
 
-    known, record = read(source, material, walks, seed or 0)
+    files.try_file(output, console.loss_plot(output))
+    known, record = read(source, material, walks, seed)
     lobes, directional = _variant(variant)
     recipe = recipe_for(
         known,
@@ -283,7 +286,7 @@ def _finish(adapter, run, output: Path) -> None:
     from nma.train.plot import plot_losses
 
     adapter.save(output)
-    plot = plot_losses(run.log_losses, output.with_suffix(".loss.png"), output.name)
+    plot = plot_losses(run.log_losses, console.loss_plot(output), output.name)
     console.err.print(
         f"{output}: {adapter.variant}, {run.step} steps in {run.seconds:.0f} s, "
         f"log loss of the last steps {np.mean(run.log_losses[-500:]):.5f} (against noisy bins); losses in {plot}"

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from nma.cli import console
+from nma import files
+from nma.cli import console, options
 
 library = typer.Typer(
     no_args_is_help=True, help="Look at a library, learn the code of one more material, take one out."
@@ -32,10 +33,10 @@ def train_library(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
-    network: Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Peak of the learning rate.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of codes, weights and batches.")] = None,
+    network: options.Network = None,
+    steps: options.Steps = None,
+    learning_rate: options.Rate = None,
+    seed: Annotated[int, options.seed("Seed of codes, weights and batches.")] = 0,
 ) -> None:
     """Train one small network on many materials, with a code for each: a library (paper Fig. 12).
 
@@ -47,6 +48,9 @@ def train_library(
     from nma.train import library as training
     from nma.train.plot import plot_losses
 
+    kept, checkpoint = (output.with_name(output.name + ending) for ending in (".tables", ".ckpt"))
+    files.try_file(output, checkpoint, console.loss_plot(output))
+    files.try_folder(kept)
     members = collection.members(source)
     names = [member.name for member in members]
     given: dict[str, Any] = {"network": network, "steps": steps, "learning_rate": learning_rate, "seed": seed}
@@ -59,16 +63,15 @@ def train_library(
             rate = done / (time.perf_counter() - began)
             bar.update(task, completed=done, rate=f"{rate:.2f}", note=names[done - 1])
 
-        tables = collection.tables(members, output.with_name(output.name + ".tables"), progress)
+        tables = collection.tables(members, kept, progress)
     record: dict[str, Any] = {"data": collection.origin(members), "materials": len(members)}
     record["tables"] = hashlib.sha256("\n".join(names).encode() + tables.values.tobytes()).hexdigest()[:16]
-    checkpoint = output.with_name(output.name + ".ckpt")
     with console.TrainingBar(recipe) as training_bar:
         made, run = training.train_library(
             names, tables, recipe, record, checkpoint=checkpoint, progress=training_bar.update
         )
     made.save(output)
-    plot = plot_losses(run.log_losses, output.with_suffix(".loss.png"), output.name)
+    plot = plot_losses(run.log_losses, console.loss_plot(output), output.name)
     checkpoint.unlink(missing_ok=True)
     recent = run.log_losses[-500:]
     console.err.print(
@@ -100,8 +103,8 @@ def encode(
     name: Annotated[
         str | None, typer.Option(help="What to call it; without, its own name or the file's.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the batches.")] = 0,
+    steps: options.Steps = None,
+    seed: Annotated[int, options.seed("Seed of the batches.")] = 0,
 ) -> None:
     """Learn the code of a material that the library has not seen; its network stays as it is.
 
@@ -113,6 +116,7 @@ def encode(
     from nma.tabulation import tabulate_values
     from nma.train import library as training
 
+    files.try_file(output)
     known = Library.load(path)
     name = name or material or source.stem
     if name in known.names:
@@ -147,6 +151,7 @@ def extract(
     """
     from nma.library import Library
 
+    files.try_file(output)
     known = Library.load(path)
     shares = dict(_share(text) for text in materials)
     code = known.mix(list(shares), list(shares.values()))

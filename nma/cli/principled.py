@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from nma.cli import console
+from nma import files
+from nma.cli import console, options
 
 
 def register(app: typer.Typer) -> None:
@@ -37,11 +37,9 @@ def principled(
             help="A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors).",
         ),
     ] = None,
-    walks: Annotated[
-        int, typer.Option(help="Walks of the table, if the material is simulated.")
-    ] = 16_000_000,
-    steps: Annotated[int | None, typer.Option(help="Number of optimisation steps.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the walks and of the batches.")] = 0,
+    walks: Annotated[int, options.walks("Walks of the table, if the material is simulated.")] = 16_000_000,
+    steps: options.Steps = None,
+    seed: Annotated[int, options.seed("Seed of the walks and of the batches.")] = 0,
 ) -> None:
     """Fit the constant parameters of one plain Principled BRDF, and print them as a dictionary of Mitsuba's.
 
@@ -52,6 +50,8 @@ def principled(
     """
     if output is not None and output.suffix not in (".xml", ".json", ".safetensors"):
         raise typer.BadParameter(f"output {output} must end in .xml, .json or .safetensors")
+    if output is not None:
+        files.try_file(output)
     from nma.cli.material import tables_of
     from nma.export.mitsuba import principled_dict, principled_xml
     from nma.train.constant import CONSTANT, fit_constant
@@ -73,19 +73,10 @@ def principled(
     if output.suffix == ".safetensors":
         fit.adapter.save(output)
     else:
-        _write(
-            output, principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
-        )
+        text = principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
+        files.write_bytes(output, text.encode())
     console.err.print(f"wrote {output}", highlight=False, soft_wrap=True)
 
 
 def _json(description: dict[str, Any]) -> str:
     return json.dumps(description, indent=2)
-
-
-def _write(path: Path, text: str) -> None:
-    """Writes the file, atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)

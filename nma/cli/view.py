@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from nma.cli import console
+from nma import files
+from nma.cli import console, options
 
 if TYPE_CHECKING:
     from nma.materials import Material
@@ -34,8 +35,8 @@ _Envmap = Annotated[
     Path | None, typer.Option(help="Light by this environment map (EXR or HDR) instead of sun, sky and lamp.")
 ]
 _Size = Annotated[str, typer.Option(help="Pixels: 512 for a square, or 512x384.")]
-_Depth = Annotated[int, typer.Option(help="Longest path, in edges.")]
-_Seed = Annotated[int, typer.Option(help="Equal seeds give equal pictures.")]
+_Depth = Annotated[int, options.number("Longest path, in edges.", 1, 1000)]
+_Seed = Annotated[int, options.seed("Equal seeds give equal pictures.")]
 _Variant = Annotated[
     str,
     typer.Option(
@@ -76,11 +77,11 @@ def render(
         typer.Option(help="Pixels: 512 for a square, or 512x384.", show_default="512, or the scene's"),
     ] = None,
     spp: Annotated[
-        int | None, typer.Option(help="Samples per pixel.", show_default="128, or the scene's")
+        int | None, options.samples("Samples per pixel.", show_default="128, or the scene's")
     ] = None,
     depth: _Depth = 6,
     seed: _Seed = 0,
-    exposure: Annotated[float, typer.Option(help="Stops that brighten the PNG; the EXR stays linear.")] = 0.0,
+    exposure: Annotated[float, options.exposure("Stops that brighten the PNG; the EXR stays linear.")] = 0.0,
     define: Annotated[
         list[str] | None,
         typer.Option(
@@ -100,7 +101,8 @@ def render(
     Examples: [bold]nma render gold-red-lacquer --camera close --set alpha_top=.05[/bold],
     [bold]nma render my-material.toml --model layered -o out/my.exr[/bold], [bold]nma render scene.xml --spp 256[/bold]
     """
-    files = _outputs(output or Path("out", Path(subject).stem + ".png"))
+    pictures = _outputs(output or Path("out", Path(subject).stem + ".png"))
+    files.try_file(*pictures)
     pixels = _pixels(size) if size else None
     if subject.endswith(".xml"):
         _refuse(context, _MATERIAL_ONLY, "an XML scene")
@@ -113,7 +115,7 @@ def render(
             _refuse(context, ("model", "adapter", "changes"), "an adapter")
             adapter = subject
         scene, spp = view.load(_material(subject, changes), model, adapter, clamp), view.spp
-    _write(_render(scene, spp, seed, subject), scene, files, exposure)
+    _write(_render(scene, spp, seed, subject), scene, pictures, exposure)
 
 
 def compare(
@@ -125,14 +127,14 @@ def compare(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="A PNG with both images and the map of their FLIP.")
     ] = None,
-    exposure: Annotated[float, typer.Option(help="Stops before ssim, flip_ldr and in the PNG.")] = 0.0,
+    exposure: Annotated[float, options.exposure("Stops before ssim, flip_ldr and in the PNG.")] = 0.0,
     adapter: _AdapterName = "layered3-5x64",
     clamp: _Clamp = False,
     changes: _Set = None,
     camera: _Camera = "hero",
     envmap: _Envmap = None,
     size: _Size = "256",
-    spp: Annotated[int, typer.Option(help="Samples per pixel.")] = 256,
+    spp: Annotated[int, options.samples("Samples per pixel.")] = 256,
     depth: _Depth = 6,
     seed: _Seed = 0,
     variant: _Variant = "auto",
@@ -148,6 +150,9 @@ def compare(
     from nma import image_metrics
     from nma.image_io import read_image
 
+    image_metrics.ensure_libraries()
+    if output:
+        files.try_file(output)
     if reference is not None:
         pictures = {"image": read_image(test), "reference": read_image(reference)}
     else:
@@ -173,15 +178,19 @@ def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out/demo.png"),
     adapter: _AdapterName = "layered3-5x64",
     size: _Size = "256",
-    spp: Annotated[int, typer.Option(help="Samples per pixel of the frames that are timed.")] = 64,
-    runs: Annotated[int, typer.Option(help="Frames of each kind, with seeds of their own.")] = 3,
-    reference_spp: Annotated[int, typer.Option(help="Samples per pixel of the converged reference.")] = 512,
+    spp: Annotated[int, options.samples("Samples per pixel of the frames that are timed.")] = 64,
+    runs: Annotated[int, options.number("Frames of each kind, with seeds of their own.", 2, 1000)] = 3,
+    reference_spp: Annotated[int, options.samples("Samples per pixel of the converged reference.")] = 512,
     variant: _Variant = "auto",
 ) -> None:
     """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.
 
     Writes a sheet of pictures and prints the table below it. Takes about two minutes on two CPU cores.
     """
+    from nma import image_metrics
+
+    image_metrics.ensure_libraries()
+    files.try_file(output)
     import nma.render
     from nma.render import demo as demonstration
 
@@ -267,12 +276,12 @@ def _samples_bar(title: str, total: int):
         yield advance
 
 
-def _write(image: Any, scene: Any, files: tuple[Path, Path], exposure: float) -> None:
+def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float) -> None:
     """All channels as EXR, the colours as PNG."""
     from nma.image_io import write_exr, write_png
 
     layers = [layer.name for layer in scene.sensors()[0].film().bitmap().struct_()]
-    write_exr(files[0], image, layers if image.shape[2] > 4 else ())
+    write_exr(pictures[0], image, layers if image.shape[2] > 4 else ())
     colours = (
         image[..., :3]
         if image.shape[2] > 3
@@ -280,8 +289,8 @@ def _write(image: Any, scene: Any, files: tuple[Path, Path], exposure: float) ->
         if image.shape[2] == 1
         else image
     )
-    write_png(files[1], colours, exposure=exposure)
-    console.err.print(f"{files[0]} (linear), {files[1]}")
+    write_png(pictures[1], colours, exposure=exposure)
+    console.err.print(f"{pictures[0]} (linear), {pictures[1]}")
 
 
 def _write_difference(path: Path, title: str, name: str, test: Any, reference: Any, exposure: float) -> None:

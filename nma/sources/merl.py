@@ -10,7 +10,6 @@ Azimuths phi_d and phi_d + pi share an entry: the format takes reciprocity for g
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from nma import ops
 from nma.errors import SourceError
+from nma.files import write_bytes
 from nma.jit import dr
 from nma.ops import Color, Vec3
 from nma.sources import files
@@ -76,11 +76,7 @@ class Merl:
 
     def save(self, path: str | Path) -> None:
         """Writes a file, atomically."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        partial.write_bytes(np.array(SHAPE, "<i4").tobytes() + self.planes.astype("<f8").tobytes())
-        partial.replace(path)
+        write_bytes(path, np.array(SHAPE, "<i4").tobytes() + self.planes.astype("<f8").tobytes())
 
     @staticmethod
     def of(values: Values) -> Merl:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -17,6 +16,7 @@ import numpy as np
 import optax
 
 from nma.errors import NmaError
+from nma.files import whole
 from nma.train.data import batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
@@ -160,10 +160,8 @@ def save(run: Run, recipe: Recipe, path: Path) -> None:
         "seconds": run.seconds,
         "scale": run.scale,
     }
-    partial_path = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    with partial_path.open("wb") as f:
+    with whole(path) as file, file.open("wb") as f:
         np.savez(f, notes=json.dumps(notes), losses=run.losses, log_losses=run.log_losses, **arrays)
-    partial_path.replace(path)
 
 
 def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] | None = None) -> Run:

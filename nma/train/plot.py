@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nma.files import whole
+
 
 def plot_losses(log_losses: Sequence[float], path: Path, title: str) -> Path:
     """Plots the log loss (eq. 7) over steps on logarithmic axes, smoothed over a hundredth of the run, as a PNG."""
@@ -22,5 +24,6 @@ def plot_losses(log_losses: Sequence[float], path: Path, title: str) -> Path:
     )
     axes.plot(steps, smooth)
     axes.grid(alpha=0.3, which="both")
-    figure.savefig(path, dpi=110)
+    with whole(path) as file:
+        figure.savefig(file, dpi=110)
     return path

@@ -1,0 +1,37 @@
+"""Options that several commands share. Numbers have a smallest and a largest value, where they are declared."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+
+def number(help: str, low: float, high: float, **more: Any) -> Any:
+    """A number between two bounds, both included; NaN lies outside."""
+    return typer.Option(min=low, max=high, help=help, **more)
+
+
+def walks(help: str) -> Any:
+    return number(help, 1, 10**12)
+
+
+def seed(help: str) -> Any:
+    return number(help, 0, 2**32 - 1)
+
+
+def samples(help: str, **more: Any) -> Any:
+    """Samples per pixel."""
+    return number(help, 1, 2**16, **more)
+
+
+def exposure(help: str) -> Any:
+    return number(help, -32, 32)
+
+
+_STEPS = number("Number of optimisation steps.", 1, 10**9)
+_RATE = number("Learning rate of Adam, its peak under the one-cycle schedule.", 1e-9, 10)
+
+Steps = Annotated[int | None, _STEPS]
+Rate = Annotated[float | None, _RATE]
+Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.")]

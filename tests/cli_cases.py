@@ -1,0 +1,34 @@
+"""The commands and their options as they are declared, for tests that loop over them."""
+
+from typing import get_args, get_type_hints
+
+from typer.models import OptionInfo
+
+from nma import cli
+
+
+def commands(app=cli.app, path=()):
+    """Every command's words, (`library`, `encode`) for example, and its function."""
+    for command in app.registered_commands:
+        name = command.name or command.callback.__name__.replace("_", "-")
+        yield (*path, name), command.callback
+    for group in app.registered_groups:
+        yield from commands(group.typer_instance, (*path, group.name))
+
+
+def parameters(function):
+    """Name, type and declaration of each parameter of a command; optional ones by the type that they have if given."""
+    for name, hint in get_type_hints(function, include_extras=True).items():
+        if name == "return" or not hasattr(hint, "__metadata__"):
+            continue
+        kinds = [kind for kind in get_args(hint.__origin__) if kind is not type(None)] or [hint.__origin__]
+        yield name, kinds[0], hint.__metadata__[0]
+
+
+def numbers():
+    """(words of the command, option, its declaration) of all numbers that commands take."""
+    for words, function in commands():
+        for name, kind, info in parameters(function):
+            if kind in (int, float) and isinstance(info, OptionInfo):
+                named = [word for word in info.param_decls if word.startswith("--")]
+                yield words, named[0] if named else f"--{name.replace('_', '-')}", info

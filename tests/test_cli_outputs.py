@@ -1,0 +1,138 @@
+"""Commands try their outputs before they begin, and end in one line where something cannot be written."""
+
+import errno
+import sys
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from cli_cases import commands, parameters
+from typer.models import ArgumentInfo
+
+from nma import table
+from nma.image_io import write_exr
+from nma.table import Tables
+
+WRITING = [words for words, function in commands() if "output" in {name for name, *_ in parameters(function)}]
+FUNCTIONS = dict(commands())
+
+
+def arguments(words, output):
+    """The command with its output and, in place of all that it reads, names of nothing."""
+    given = []
+    for name, _, info in parameters(FUNCTIONS[words]):
+        if isinstance(info, ArgumentInfo):
+            given.append(output if name == "output" else "nothing.exr")
+    positional = "output" in [n for n, _, i in parameters(FUNCTIONS[words]) if isinstance(i, ArgumentInfo)]
+    return (*words, *given, *(() if positional else ("-o", output)))
+
+
+@pytest.fixture
+def bad(tmp_path, monkeypatch):
+    """A folder with outputs that cannot be, of whatever kind a command writes."""
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("mine")
+    return tmp_path
+
+
+def test_all_commands_that_write_are_known():
+    names = {words[0] for words in WRITING}
+    assert {"render", "compare", "demo", "simulate", "dataset", "train", "fit", "principled"} <= names
+    assert {("library", "encode"), ("library", "extract"), ("train-library",)} <= set(WRITING)
+
+
+@pytest.mark.parametrize("words", WRITING, ids="-".join)
+@pytest.mark.parametrize("place", ["file/sub/x{}", "n" * 300 + "{}", "full/x{}"])
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
+    nma, bad, monkeypatch, words, place
+):
+    if place.startswith("full"):
+
+        def full(*args, **kwargs):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(Path, "write_bytes", full)
+    ending = {"render": ".png", "principled": ".xml"}.get(words[0], "")
+    code, out, err = nma(*arguments(words, place.format(ending)))
+    assert (code, out) == (1, ""), err
+    assert err.startswith("nma: ") and err.count("\n") == 1
+    assert "cannot be written" in err
+    assert [path.name for path in bad.iterdir()] == ["file"]
+
+
+def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, monkeypatch):
+    save = np.savez_compressed
+
+    def fills_up(file, **arrays):
+        save(file, **arrays)
+        if not file.name.startswith(str(tmp_path / "x.npz.parts")):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fills_up)
+    code, out, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")
+    assert (code, out) == (1, "")
+    assert "nma: " in err.splitlines()[-1] and "No space left" in err.splitlines()[-1]
+    # What was simulated waits for the next run.
+    assert [path.name for path in tmp_path.iterdir()] == ["x.npz.parts"]
+    monkeypatch.undo()
+    monkeypatch.setattr(table, "tabulate", None)
+    assert nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")[0] == 0
+
+
+def test_errors_of_the_system_elsewhere_are_one_line(nma, monkeypatch):
+    def no_folder():
+        raise PermissionError(errno.EACCES, "Permission denied", "/root/cache")
+
+    monkeypatch.setattr("nma.native.build_mitsuba", lambda say: no_folder())
+    assert nma("mitsuba", "build") == (1, "", "nma: /root/cache: Permission denied\n")
+
+
+@pytest.mark.parametrize("words", [("demo",), ("compare", "gold-red-lacquer"), ("compare", "a.exr", "b.exr")])
+def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    write_exr("a.exr", np.zeros((16, 16, 3)))
+    write_exr("b.exr", np.zeros((16, 16, 3)))
+    monkeypatch.setattr("nma.render.progressive.render_passes", None)
+    monkeypatch.setattr("nma.render.measure.measure", None)
+    for name in ("skimage", "skimage.metrics"):
+        monkeypatch.setitem(sys.modules, name, None)
+    code, out, err = nma(*words)
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1 and "pip install" in err
+    assert not Path("out").exists()
+
+
+def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
+    output = tmp_path / "x.npz"
+    run = ("simulate", "--draw", 2, "--walks", 1600, "--seed", 5, "-o")
+    assert nma(*run, tmp_path / "right.npz")[0] == 0
+    parts = tmp_path / "x.npz.parts"
+    parts.mkdir()
+    for key in table.stream_keys(5, range(2)):
+        (parts / f"{key:016x}-1600.npz").write_bytes(b"PK\x03\x04damaged")
+    code, _, err = nma(*run, output)
+    assert code == 0, err
+    np.testing.assert_array_equal(Tables.load(output).values, Tables.load(tmp_path / "right.npz").values)
+    assert not parts.exists()
+
+
+def test_parts_that_another_run_takes_away_do_no_harm(tmp_path):
+    """Two runs into one output: the first that ends removes the folder, at any moment of the other."""
+    one = Tables(np.zeros((1, 1)), np.ones((1, 2, 2, 2, 3)), np.ones(1, int))
+    parts = tmp_path / "x.npz.parts"
+
+    def tidy():
+        for _ in range(200):
+            for path in parts.glob("*"):
+                path.unlink(missing_ok=True)
+            try:
+                parts.rmdir()
+            except OSError:
+                pass
+
+    other = Thread(target=tidy)
+    other.start()
+    made = [table.kept(parts / f"{n}.npz", lambda: one) for n in range(50)]
+    other.join()
+    assert len(made) == 50

@@ -1,0 +1,103 @@
+"""Files are whole or not there, and what cannot be written is refused beforehand."""
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nma import image_io
+from nma.errors import OutputError
+from nma.files import try_file, try_folder, whole, write_bytes
+from nma.sources.merl import SHAPE, Merl
+from nma.table import Tables
+from nma.train.plot import plot_losses
+
+IMAGE = np.full((4, 4, 3), 0.5, np.float32)
+
+
+def contents(folder: Path) -> list[str]:
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
+
+
+@pytest.fixture
+def places(tmp_path) -> dict[str, Path]:
+    """Outputs that cannot be, by what is wrong with them."""
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "file").write_text("mine")
+    return {
+        "a folder has this name": tmp_path / "folder.npz",
+        "a file where a folder is wanted": tmp_path / "file" / "sub" / "a.npz",
+        "name too long": tmp_path / ("n" * 300 + ".npz"),
+        "too long": tmp_path / ("n" * 300) / "a.npz",
+        "no ordinary file": Path(os.devnull),
+    }
+
+
+@pytest.mark.parametrize("write", [try_file, lambda path: write_bytes(path, b"content")])
+def test_what_cannot_be_written_is_refused_in_one_line_that_says_why(places, tmp_path, write):
+    before = contents(tmp_path)
+    for reason, path in places.items():
+        with pytest.raises(OutputError) as error:
+            write(path)
+        assert reason in str(error.value).lower()
+        assert "\n" not in str(error.value) and len(str(error.value)) < 400
+    assert contents(tmp_path) == before
+
+
+def test_a_trial_leaves_no_trace(tmp_path):
+    try_file(tmp_path / "new" / "folder" / "a.npz", tmp_path / "b.npz")
+    try_folder(tmp_path / "new" / "folder")
+    assert contents(tmp_path) == []
+    (tmp_path / "b.npz").write_text("old")
+    try_file(tmp_path / "b.npz")
+    assert (tmp_path / "b.npz").read_text() == "old"
+    with pytest.raises(OutputError, match="a file where a folder is wanted"):
+        try_folder(tmp_path / "b.npz")
+
+
+def test_names_as_long_as_the_system_allows_are_written(tmp_path):
+    path = tmp_path / ("n" * (os.pathconf(tmp_path, "PC_NAME_MAX") - 4) + ".npz")
+    try_file(path)
+    write_bytes(path, b"content")
+    assert path.read_bytes() == b"content"
+
+
+def test_a_failed_write_keeps_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_text("old")
+    with pytest.raises(ZeroDivisionError), whole(path) as file:
+        file.write_text("new")
+        assert file.suffix == ".png"
+        1 / 0  # noqa: B018
+    assert contents(tmp_path) == ["a.png"]
+    assert path.read_text() == "old"
+
+
+def _full(*args, **kwargs):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+WRITERS = {
+    "tables": lambda path: Tables(np.zeros((1, 0)), np.zeros((1, 2, 2, 2, 3)), np.ones(1, int)).save(path),
+    "merl": lambda path: Merl(np.ones((3, *SHAPE))).save(path),
+    "png": lambda path: image_io.write_png(path, IMAGE),
+    "exr": lambda path: image_io.write_exr(path, IMAGE),
+    "plot": lambda path: plot_losses([1.0, 2.0, 3.0], path, "losses"),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, writer):
+    """Whoever writes does so by `whole`, whose last step fails here, as it would on a full disk."""
+    monkeypatch.setattr(Path, "replace", _full)
+    with pytest.raises(OutputError, match="No space left on device.*free some space"):
+        WRITERS[writer](tmp_path / "a.png")
+    assert contents(tmp_path) == []
+
+
+def test_a_full_disk_is_noticed_by_the_trial(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "write_bytes", _full)
+    with pytest.raises(OutputError, match="free some space"):
+        try_file(tmp_path / "a.png")
