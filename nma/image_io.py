@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nma.errors import NmaError
+from nma.errors import NmaError, one_line
 from nma.files import whole, write_bytes
+from nma.image_size import MOST_PIXELS, header_size
 
 
 class ImageError(NmaError, ValueError):
@@ -101,11 +102,25 @@ def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) 
 
 
 def load_bitmap(path: str | Path) -> Any:
-    """The file as Mitsuba's bitmap. Raises `RuntimeError` where Mitsuba cannot decode it."""
+    """The file as Mitsuba's bitmap. Raises `RuntimeError` where Mitsuba cannot decode it, and as `check_size` does."""
     import mitsuba as mi
 
+    check_size(path)
     with _second_thread():
         return mi.Bitmap(str(path))
+
+
+def check_size(path: str | Path) -> None:
+    """Refuses images of too many pixels by their header, before they take memory. Raises `ImageError`."""
+    try:
+        size = header_size(path)
+    except OSError as error:
+        raise ImageError(f"image {path} cannot be read: {error.strerror}") from None
+    if size and size[0] * size[1] > MOST_PIXELS:
+        raise ImageError(
+            f"image {path} claims {size[0]} x {size[1]} pixels; at most {MOST_PIXELS:,} are read, 16384 x 8192 for "
+            "example: make it smaller"
+        )
 
 
 @contextmanager
@@ -141,7 +156,7 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
             bitmap = coloured_layer(bitmap)
         return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
     except RuntimeError as error:
-        raise ImageError(f"image {path} cannot be read: {error}") from error
+        raise ImageError(f"image {path} cannot be read: {one_line(str(error))}") from error
 
 
 def coloured_layer(bitmap: Any) -> Any:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError
+from nma.image_io import check_size
 from nma.llvm import ensure_llvm
 from nma.render.shaderball import shader_ball_file
 
@@ -245,6 +246,7 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
 def _environment(path: Path, scale: float) -> dict[str, Any]:
     if not path.is_file():
         raise ParamError(f"environment map {path} does not exist; pass an EXR or HDR file")
+    check_size(path)
     return {"sky": {"type": "envmap", "filename": str(path), "scale": scale, "to_world": _upright()}}
 
 

@@ -1,0 +1,99 @@
+"""The size of an image is read from its header, and one that takes all memory is refused by it."""
+
+import struct
+import zlib
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from nma import materials
+from nma.errors import NmaError
+from nma.image_io import ImageError, load_bitmap, read_image, write_exr
+from nma.image_size import header_size
+from nma.render.scene import preview_scene
+
+FORMATS = ("png", "jpg", "bmp", "tga", "ppm", "hdr", "pfm", "exr")
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    mi.set_variant(mi.variant() or "llvm_ad_rgb")
+
+
+def image(path, kind, width=7, height=5):
+    """A file of this kind."""
+    if kind in ("hdr", "pfm", "exr"):
+        mi.Bitmap(np.zeros((height, width, 3), np.float32)).write(str(path))
+    else:
+        Image.new("RGB", (width, height)).save(path)
+    return path
+
+
+def bomb(path, kind):
+    """A file that claims to be larger than it is."""
+    content, large = image(path, kind).read_bytes(), 65_000 if kind in ("jpg", "tga") else 100_000
+    old, new = (_written(kind, *size) for size in ((7, 5), (large, large)))
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+    return path
+
+
+def _written(kind, width, height):
+    """A size as headers of this kind have it."""
+    match kind:
+        case "png":
+            ihdr = b"IHDR" + struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
+            return ihdr + struct.pack(">I", zlib.crc32(ihdr))
+        case "jpg":
+            return struct.pack(">HH", height, width)
+        case "bmp" | "tga":
+            return struct.pack("<ii" if kind == "bmp" else "<HH", width, height)
+        case "exr":
+            return struct.pack("<4i", 0, 0, width - 1, height - 1)
+        case "hdr":
+            return b"-Y %d +X %d" % (height, width)
+    return b"%d %d" % (width, height)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_the_size_is_that_of_the_image(tmp_path, kind):
+    path = image(tmp_path / f"a.{kind}", kind)
+    assert header_size(path) == (7, 5)
+    assert read_image(path).shape == (5, 7, 3)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_an_image_that_takes_all_memory_is_refused_by_its_header(tmp_path, monkeypatch, kind):
+    path = bomb(tmp_path / f"bomb.{kind}", kind)
+    assert path.stat().st_size < 2000
+    monkeypatch.setattr(mi, "Bitmap", None)
+    with pytest.raises(ImageError, match=r"bomb.* claims (100000 x 100000|65000 x 65000) pixels; at most"):
+        read_image(path)
+
+
+def test_textures_and_environment_maps_are_looked_at_too(tmp_path):
+    texture = {"texture": str(bomb(tmp_path / "bomb.png", "png"))}
+    material = materials.load("wet-nickel").changed({"alpha_top": texture}, "--set")
+    with pytest.raises(NmaError, match="bomb.png claims"):
+        material.values["alpha_top"].read()
+    with pytest.raises(NmaError, match="bomb.hdr claims"):
+        preview_scene({"type": "diffuse"}, envmap=bomb(tmp_path / "bomb.hdr", "hdr"))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xd8", b"\xff\xd8\xff\xff\xff\xff", b"BM", b"P6 1", b"no image at all"]
+)
+def test_what_is_no_image_has_no_size(tmp_path, content):
+    (tmp_path / "a.png").write_bytes(content)
+    assert header_size(tmp_path / "a.png") is None
+    with pytest.raises(ImageError, match="a.png") as error:
+        read_image(tmp_path / "a.png")
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_is_no_image(tmp_path):
+    with pytest.raises(ImageError, match="cannot be read: Is a directory"):
+        load_bitmap(tmp_path)
+    assert header_size(write_exr(tmp_path / "a.exr", np.zeros((2, 3)))) == (3, 2)
