@@ -1,4 +1,6 @@
 // A reader for JSON (RFC 8259), as far as the headers of weights files need it: a tree of values, strict, bounded depth.
+//
+// Of types that are not complete yet, the standard allows vectors, but no pairs.
 #pragma once
 
 #include <cstdint>
@@ -24,13 +26,13 @@ struct Json {
     bool boolean = false;
     double number = 0.0;
     std::string string;
-    std::vector<Json> items;                            // of an array
-    std::vector<std::pair<std::string, Json>> fields;   // of an object, in order
+    std::vector<Json> items;         // of an array or an object, in order
+    std::vector<std::string> names;  // of an object's items
 
     // The field called `name`, or null.
     const Json* find(std::string_view name) const {
-        for (const auto& [key, value] : fields)
-            if (key == name) return &value;
+        for (std::size_t k = 0; k < names.size(); ++k)
+            if (names[k] == name) return &items[k];
         return nullptr;
     }
 
@@ -57,6 +59,7 @@ public:
     }
 
 private:
+    // Arrays and objects inside each other.
     static constexpr int DEEPEST = 32;
 
     [[noreturn]] void fail(const char* what) const {
@@ -80,12 +83,11 @@ private:
     }
 
     Json value(int depth) {
-        if (depth > DEEPEST) fail("nested too deep");
         space();
         Json made;
         switch (peek()) {
-            case '{': made.kind = Json::Kind::Object; fields(made, depth); break;
-            case '[': made.kind = Json::Kind::Array; items(made, depth); break;
+            case '{': made.kind = Json::Kind::Object; fields(made, deeper(depth)); break;
+            case '[': made.kind = Json::Kind::Array; items(made, deeper(depth)); break;
             case '"': made.kind = Json::Kind::String; made.string = string(); break;
             case 't': expect("true"); made.kind = Json::Kind::Boolean; made.boolean = true; break;
             case 'f': expect("false"); made.kind = Json::Kind::Boolean; break;
@@ -93,6 +95,11 @@ private:
             default: made.kind = Json::Kind::Number; made.number = number();
         }
         return made;
+    }
+
+    int deeper(int depth) const {
+        if (depth == DEEPEST) fail("nested too deep");
+        return depth + 1;
     }
 
     void fields(Json& made, int depth) {
@@ -104,7 +111,8 @@ private:
             std::string key = string();
             space();
             expect(":");
-            made.fields.emplace_back(std::move(key), value(depth + 1));
+            made.names.push_back(std::move(key));
+            made.items.push_back(value(depth));
             space();
         } while (take(","));
         expect("}");
@@ -115,7 +123,7 @@ private:
         space();
         if (take("]")) return;
         do {
-            made.items.push_back(value(depth + 1));
+            made.items.push_back(value(depth));
             space();
         } while (take(","));
         expect("]");

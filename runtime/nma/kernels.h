@@ -1,7 +1,8 @@
 // `Adapter::prepare` for each instruction set, chosen at run time: one binary serves all CPUs.
 //
 // Every instruction set compiles the same code, kernels/body.inl, over its own vector type; avx512_bf16 has a product of
-// its own, which rounds weights and activations to bfloat16.
+// its own, which rounds weights and activations to bfloat16. For compilers that fail on it (clang 16 does at -O1), the macro
+// NMA_NO_AVX512_BF16 leaves it out; NMA_PORTABLE_ONLY leaves out all but portable code.
 #pragma once
 
 #include <cstdint>
@@ -11,7 +12,9 @@
 #if (defined(__x86_64__) || defined(_M_X64)) && !defined(NMA_PORTABLE_ONLY)
 #include "kernels/avx2.h"
 #include "kernels/avx512.h"
+#if !defined(NMA_NO_AVX512_BF16)
 #include "kernels/avx512_bf16.h"
+#endif
 #define NMA_X86 1
 #if defined(_MSC_VER)
 #include <intrin.h>
@@ -66,6 +69,9 @@ inline bool cpu_has(InstructionSet set) {
 inline bool supported(InstructionSet set) {
     if (set == InstructionSet::portable) return true;
 #if defined(NMA_X86)
+#if defined(NMA_NO_AVX512_BF16)
+    if (set == InstructionSet::avx512_bf16) return false;
+#endif
     return set != InstructionSet::neon && detail::cpu_has(set);
 #elif defined(NMA_ARM)
     return set == InstructionSet::neon;
@@ -104,10 +110,12 @@ inline const Kernels& kernels(InstructionSet set) {
 #if defined(NMA_X86)
     static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many, avx2::encode, avx2::decode, avx2::odds, avx2::prepare<avx2::forward>};
     static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many, avx512::encode, avx512::decode, avx512::odds, avx512::prepare_either};
+#if !defined(NMA_NO_AVX512_BF16)
     static constexpr Kernels BF16{InstructionSet::avx512_bf16, avx512_bf16::forward, avx512_bf16::forward_many, avx512::encode, avx512::decode, avx512::odds, avx512::prepare<avx512_bf16::forward>};
+    if (set == InstructionSet::avx512_bf16) return BF16;
+#endif
     if (set == InstructionSet::avx2) return AVX2;
     if (set == InstructionSet::avx512) return AVX512;
-    if (set == InstructionSet::avx512_bf16) return BF16;
 #elif defined(NMA_ARM)
     static constexpr Kernels NEON{InstructionSet::neon, neon::forward, neon::forward_many, neon::encode, neon::decode, neon::odds, neon::prepare<neon::forward>};
     if (set == InstructionSet::neon) return NEON;
