@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import math
 import re
 import struct
 import sys
@@ -9,6 +10,7 @@ import textwrap
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 from nma.errors import WeightsError
@@ -18,22 +20,69 @@ from nma.export.functions import Unsupported, parsed
 from nma.runtime import Runtime
 
 ROOT = Path(__file__).parent.parent
-IN_PLANE = {"name": "metallic", "size": 1, "low": 0, "high": 1, "scale": "linear", "in_plane": True}
+IN_PLANE = {"name": "anisotropic", "size": 1, "low": 0, "high": 1, "scale": "linear", "in_plane": True}
 
 
 def stored(name):
     return (ROOT / "nma/adapters" / f"{name}.safetensors").read_bytes()
 
 
-def changed(name, **fields):
-    """A weights file whose metadata differ."""
+def header_of(name):
+    """A stored file's header, what it says about the adapter, and its data."""
     data = stored(name)
     size = struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8 : 8 + size])
-    about = json.loads(header["__metadata__"]["nma"]) | fields
-    header["__metadata__"]["nma"] = json.dumps(about)
+    return header, json.loads(header["__metadata__"]["nma"]), data[8 + size :]
+
+
+def packed(header, about, data):
+    header["__metadata__"]["nma"] = about if isinstance(about, str) else json.dumps(about)
     text = json.dumps(header).encode()
-    return struct.pack("<Q", len(text)) + text + data[8 + size :]
+    return struct.pack("<Q", len(text)) + text + data
+
+
+def changed(name, **fields):
+    """A weights file whose metadata differ."""
+    header, about, data = header_of(name)
+    return packed(header, about | fields, data)
+
+
+def ranged(group, number, **fields):
+    """A weights file in which a parameter of the class, or of the target, differs."""
+    about = header_of("layered3-3x32")[1]
+    about[group][number] |= fields
+    return changed("layered3-3x32", **{group: about[group]})
+
+
+def shifted(places, gap=b""):
+    """A weights file whose tensors lie some bytes later, which `gap` makes room for."""
+    header, about, data = header_of("layered3-3x32")
+    for entry in (entry for name, entry in header.items() if name != "__metadata__"):
+        entry["data_offsets"] = [places + at for at in entry["data_offsets"]]
+    return packed(header, about, gap + data)
+
+
+def of_integers(name):
+    header, about, data = header_of("layered3-3x32")
+    header[name]["dtype"] = "I32"
+    return packed(header, about, data)
+
+
+def with_more(tensor):
+    """A weights file with one more tensor after its own."""
+    header, about, data = header_of("layered3-3x32")
+    extra = {"dtype": tensor.dtype.str.replace("<f", "F").replace("4", "32").replace("8", "64")}
+    extra |= {"shape": list(tensor.shape), "data_offsets": [len(data), len(data) + tensor.nbytes]}
+    return packed(header | {"more": extra}, about, data + tensor.tobytes())
+
+
+def nested(depth):
+    """A weights file whose training record nests so deep that its metadata do so `depth` times."""
+    _, about, _ = header_of("layered3-3x32")
+    about["training"] = "HERE"
+    text = json.dumps(about).replace('"HERE"', '{"a": ' * (depth - 1) + "1" + "}" * (depth - 1))
+    header, _, data = header_of("layered3-3x32")
+    return packed(header, text, data)
 
 
 @pytest.mark.usefixtures("compiler")
@@ -64,6 +113,50 @@ def test_files_that_make_no_sense_are_refused(tmp_path, data, message):
     path.write_bytes(data)
     with pytest.raises(WeightsError, match=re.escape(f"{path}: ") + ".*" + re.escape(message)):
         Runtime(path)
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (nested(33), "nested too deep"),
+        (nested(100_000), "nested too deep"),
+        (shifted(1), "does not lie within the file"),
+        (shifted(1, b"x"), "tensor layer0.bias does not begin where the one before it ends"),
+        (shifted(0)[:-4] + b"more" * 2, "its tensors end before the file does"),
+        (of_integers("layer1.weight"), "tensor layer1.weight is not float32"),
+        (with_more(np.ones(3)), "tensor more is not float32"),
+        (ranged("parameters", 3, high=1e300), "parameter 'eta_conductor' has no valid range"),
+        (ranged("parameters", 3, high=math.inf), "JSON"),
+        (ranged("parameters", 0, low=-1.0), "parameter 'alpha_top' has no valid range"),
+        (ranged("parameters", 6, low=2.0), "parameter 'sigma_t' has no valid range"),
+        (ranged("parameters", 6, high=None), "'high'"),
+        (ranged("target", 1, high=1e300), "target parameter 'roughness' has no valid range"),
+        (ranged("target", 0, low=-5.0), "target parameter 'base_color' has no valid range"),
+        (ranged("target", 3, high=13.0), "target parameter 'specular' has no valid range"),
+        (ranged("target", 3, high=math.nan), "JSON"),
+        (ranged("target", 2, scale="cubic"), "unknown scale 'cubic'"),
+        (ranged("target", 2, in_plane=True), "'metallic' has no plane of incidence"),
+    ],
+)
+def test_files_that_are_not_to_be_believed_are_refused(tmp_path, data, message):
+    """Their numbers would become NaN, negative, or garbage that looks like values."""
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(data)
+    with pytest.raises(WeightsError, match=re.escape(f"{path}: ") + ".*" + re.escape(message)):
+        Runtime(path)
+
+
+@pytest.mark.usefixtures("compiler")
+def test_what_is_unusual_but_sound_loads(tmp_path):
+    path = tmp_path / "good.safetensors"
+    for data in (
+        nested(32),
+        with_more(np.ones((5000, 2), np.float32)),
+        with_more(np.ones((0, 3), np.float32)),
+    ):
+        path.write_bytes(data)
+        assert Runtime(path).parameters == 13
 
 
 def test_the_generated_headers_are_those_of_the_present_package():

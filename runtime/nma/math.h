@@ -3,6 +3,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <cstring>
 #include <tuple>
 
 namespace nma {
@@ -23,6 +25,16 @@ template <class T> inline T select(bool condition, T a, T b) { return condition 
 template <class T> inline T lerp(T a, T b, T t) { return a + (b - a) * t; }
 template <class T> inline T absolute(T x) { return x < T(0) ? -x : x; }
 template <class T> inline T safe_sqrt(T x) { return x > T(0) ? sqrt(x) : T(0); }
+
+inline std::uint32_t bits(float x) {
+    std::uint32_t found;
+    std::memcpy(&found, &x, sizeof(found));
+    return found;
+}
+// With -ffast-math compilers take every number for finite; only its bits tell. Those of infinity are 0x7f800000, but for the
+// sign, and those of NaN lie beyond.
+inline bool is_finite(float x) { return (bits(x) & 0x7fffffff) < 0x7f800000; }
+inline bool is_nan(float x) { return (bits(x) & 0x7fffffff) > 0x7f800000; }
 
 // A direction or an RGB colour.
 template <class T>

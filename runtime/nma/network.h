@@ -26,12 +26,6 @@ std::unique_ptr<T[], FreeAligned> aligned(std::size_t count) {
 
 constexpr int padded(int n, int step) { return (n + step - 1) / step * step; }
 
-inline std::uint32_t bits(float value) {
-    std::uint32_t found;
-    std::memcpy(&found, &value, 4);
-    return found;
-}
-
 // The upper half of a float, rounded to nearest, ties to even.
 inline std::uint32_t bfloat16(float value) { return (bits(value) + 0x7fff + (bits(value) >> 16 & 1)) >> 16; }
 

@@ -1,13 +1,16 @@
 // The weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of nma/weights.py.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <fstream>
 #include <iterator>
+#include <tuple>
 
 #include "json.h"
+#include "math.h"
 
 namespace nma {
 
@@ -30,9 +33,20 @@ struct SourceParam {
     std::string name;
     int size = 1;
     bool logarithmic = false;
-    double low = 0.0, high = 0.0;  // 0 where the file states none
+    double low = 0.0, high = 0.0;
     // (value - start) per_range lies in 0 .. 1 over the range, of the logarithm for a logarithmic one.
     float start = 0.0f, per_range = 1.0f;
+
+    // Whether x is finite and within the range, but for a rounding error.
+    bool allows(float x) const {
+        const double slack = 1e-6 * maximum(absolute(low), 1.0);
+        return is_finite(x) && x >= low - slack && x <= high + slack;
+    }
+    // The nearest number of the range; the lower end for NaN.
+    float clamped(float x) const {
+        const float least = static_cast<float>(low);
+        return is_nan(x) ? least : clip(x, least, static_cast<float>(high));
+    }
 };
 
 struct Weights {
@@ -48,6 +62,10 @@ namespace detail {
 
 constexpr int FORMAT = 1;
 constexpr int WIDEST = 4096, DEEPEST = 64;
+// Ends of ranges lie no farther from 0.
+constexpr double FARTHEST = 1e6;
+// Whole numbers up to here are doubles.
+constexpr double MOST_BYTES = 9e15;
 
 // The whole numbers of an array, each in 0 .. limit.
 inline std::vector<std::uint64_t> whole(const Json& array, double limit) {
@@ -60,44 +78,74 @@ inline std::vector<std::uint64_t> whole(const Json& array, double limit) {
     return found;
 }
 
-// The tensor `name` as floats, of which `shape` tells the sizes.
-inline std::vector<float> tensor(const Json& header, const char* data, std::size_t size, const std::string& name, std::vector<std::uint64_t>& shape) {
-    const Json& entry = header.at(name, Json::Kind::Object);
-    if (entry.at("dtype", Json::Kind::String).string != "F32") throw Error("tensor " + name + " is not float32");
-    shape = whole(entry.at("shape", Json::Kind::Array), WIDEST);
-    const auto range = whole(entry.at("data_offsets", Json::Kind::Array), 9e15);
-    std::uint64_t count = 1;
-    for (const auto extent : shape) count *= extent;
-    if (shape.empty() || shape.size() > 2 || range.size() != 2 || range[1] > size || range[0] > range[1] || range[1] - range[0] != 4 * count)
+// Where a tensor lies in the data, and its sizes.
+struct Place {
+    std::string name;
+    std::vector<std::uint64_t> shape;
+    std::uint64_t first, last;
+};
+
+inline Place place(const std::string& name, const Json& entry, std::size_t size) {
+    if (entry.kind != Json::Kind::Object) throw Error("its header has no valid entry of tensor " + name);
+    if (entry.at("dtype", Json::Kind::String).string != "F32") throw Error("tensor " + name + " is not float32; convert or train it again");
+    const auto range = whole(entry.at("data_offsets", Json::Kind::Array), MOST_BYTES);
+    Place made{name, whole(entry.at("shape", Json::Kind::Array), MOST_BYTES), 0, 0};
+    std::uint64_t bytes = sizeof(float);
+    bool fits = range.size() == 2;
+    for (const auto extent : made.shape) {
+        fits = fits && (!extent || bytes <= size / extent);
+        bytes = fits ? bytes * extent : 0;
+    }
+    if (!fits || range[1] > size || range[0] > range[1] || range[1] - range[0] != bytes)
         throw Error("tensor " + name + " does not lie within the file, or its size contradicts its shape");
-    std::vector<float> values(count);
-    if (count) std::memcpy(values.data(), data + range[0], 4 * count);
+    made.first = range[0];
+    made.last = range[1];
+    return made;
+}
+
+// The tensors of a file. They fill its data from the first byte to the last: others were shifted, or hide something.
+inline std::vector<Place> places(const Json& header, std::size_t size) {
+    std::vector<Place> made;
+    for (std::size_t k = 0; k < header.names.size(); ++k)
+        if (header.names[k] != "__metadata__") made.push_back(place(header.names[k], header.items[k], size));
+    std::sort(made.begin(), made.end(), [](const Place& a, const Place& b) { return std::tie(a.first, a.last) < std::tie(b.first, b.last); });
+    std::uint64_t end = 0;
+    for (const Place& p : made) {
+        if (p.first != end) throw Error("tensor " + p.name + " does not begin where the one before it ends; copy or train it again");
+        end = p.last;
+    }
+    if (end != size) throw Error("its tensors end before the file does; copy or train it again");
+    return made;
+}
+
+// The numbers of a tensor of so many dimensions, all of them finite, and its `shape`.
+inline std::vector<float> tensor(const std::vector<Place>& places, const char* data, const std::string& name, std::size_t dimensions, std::vector<std::uint64_t>& shape) {
+    const auto found = std::find_if(places.begin(), places.end(), [&](const Place& p) { return p.name == name; });
+    if (found == places.end()) throw Error("it lacks tensor " + name + "; copy or train it again");
+    shape = found->shape;
+    if (shape.size() != dimensions || *std::max_element(shape.begin(), shape.end()) > WIDEST) throw Error("tensor " + name + " has a shape that makes no sense");
+    std::vector<float> values((found->last - found->first) / sizeof(float));
+    if (!values.empty()) std::memcpy(values.data(), data + found->first, values.size() * sizeof(float));
     for (const float v : values)
-        if (!std::isfinite(v)) throw Error("tensor " + name + " holds numbers that are not finite; train again");
+        if (!is_finite(v)) throw Error("tensor " + name + " holds numbers that are not finite; train again");
     return values;
 }
 
-inline std::vector<Layer> layers(const Json& header, const char* data, std::size_t size, int count) {
+inline std::vector<Layer> layers(const std::vector<Place>& places, const char* data, int count) {
     std::vector<Layer> made;
     for (int k = 0; k < count; ++k) {
         const std::string name = "layer" + std::to_string(k);
         std::vector<std::uint64_t> shape, length;
         Layer layer;
-        layer.matrix = tensor(header, data, size, name + ".weight", shape);
-        layer.bias = tensor(header, data, size, name + ".bias", length);
-        if (shape.size() != 2 || length.size() != 1 || length[0] != shape[0] || !shape[0] || !shape[1] ||
-            (k && shape[1] != static_cast<std::uint64_t>(made.back().out)))
+        layer.matrix = tensor(places, data, name + ".weight", 2, shape);
+        layer.bias = tensor(places, data, name + ".bias", 1, length);
+        if (length[0] != shape[0] || !shape[0] || !shape[1] || (k && shape[1] != static_cast<std::uint64_t>(made.back().out)))
             throw Error("layer " + std::to_string(k) + " does not fit the one before it");
         layer.out = static_cast<int>(shape[0]);
         layer.in = static_cast<int>(shape[1]);
         made.push_back(std::move(layer));
     }
     return made;
-}
-
-inline double number_or_zero(const Json& entry, std::string_view name) {
-    const Json* found = entry.find(name);
-    return found && found->kind == Json::Kind::Number ? found->number : 0.0;
 }
 
 inline int small(const Json& entry, std::string_view name, int most) {
@@ -111,14 +159,18 @@ inline bool flag(const Json& entry, std::string_view name) {
     return found && found->kind == Json::Kind::Boolean && found->boolean;
 }
 
+// The fields `low` and `high`. They are finite: JSON has no word for other numbers, and the reader refuses too large ones.
+inline std::pair<double, double> range(const Json& entry) {
+    return {entry.at("low", Json::Kind::Number).number, entry.at("high", Json::Kind::Number).number};
+}
+
 inline SourceParam source_param(const Json& entry) {
     SourceParam p;
     p.name = entry.at("name", Json::Kind::String).string;
     p.size = small(entry, "size", 64);
     p.logarithmic = entry.at("law", Json::Kind::String).string == "log10";
-    p.low = number_or_zero(entry, "low");
-    p.high = number_or_zero(entry, "high");
-    if (p.logarithmic && !(p.low > 0)) throw Error("parameter '" + p.name + "' has no valid range");
+    std::tie(p.low, p.high) = range(entry);
+    if (!(-FARTHEST <= p.low && p.low <= p.high && p.high <= FARTHEST) || (p.logarithmic && !(p.low > 0))) throw Error("parameter '" + p.name + "' has no valid range");
     if (p.low < p.high) {
         p.start = static_cast<float>(p.logarithmic ? std::log(p.low) : p.low);
         p.per_range = static_cast<float>(1.0 / (p.logarithmic ? std::log(p.high / p.low) : p.high - p.low));
@@ -126,15 +178,27 @@ inline SourceParam source_param(const Json& entry) {
     return p;
 }
 
+// What a Principled BRDF is defined for. Twin of _LIMITS in nma/target/decode.py.
+inline std::pair<double, double> limits(const std::string& name) {
+    if (name == "specular") return {0.0, 12.0};
+    if (name == "anisotropic") return {-FARTHEST, 1.0};
+    if (name == "fade") return {-1.0, 1.0};
+    if (name == "fade_width") return {0.0, FARTHEST};
+    return {0.0, 1.0};
+}
+
 inline TargetParam target_param(const Json& entry) {
     TargetParam p;
     p.name = entry.at("name", Json::Kind::String).string;
     p.size = small(entry, "size", 3);
-    p.low = entry.at("low", Json::Kind::Number).number;
-    p.high = entry.at("high", Json::Kind::Number).number;
-    p.logarithmic = entry.at("scale", Json::Kind::String).string == "log";
+    std::tie(p.low, p.high) = range(entry);
+    const std::string& scale = entry.at("scale", Json::Kind::String).string;
+    p.logarithmic = scale == "log";
     p.in_plane = flag(entry, "in_plane");
-    if (!(p.low < p.high) || (p.logarithmic && !(p.low > 0))) throw Error("target parameter '" + p.name + "' has no valid range");
+    const auto [least, most] = limits(p.name);
+    if (!(least <= p.low && p.low < p.high && p.high <= most) || (p.logarithmic && !(p.low > 0))) throw Error("target parameter '" + p.name + "' has no valid range");
+    if (!p.logarithmic && scale != "linear") throw Error("target parameter '" + p.name + "' has the unknown scale '" + scale + "'");
+    if (p.in_plane && p.name != "anisotropic") throw Error("target parameter '" + p.name + "' has no plane of incidence");
     return p;
 }
 
@@ -158,7 +222,8 @@ inline Weights weights(const char* bytes, std::size_t size) {
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
     if (hidden.size() >= DEEPEST) throw Error("a network of too many layers");
-    made.layers = layers(header, bytes + 8 + length, size - 8 - static_cast<std::size_t>(length), static_cast<int>(hidden.size()) + 1);
+    const char* data = bytes + 8 + length;
+    made.layers = layers(places(header, size - 8 - static_cast<std::size_t>(length)), data, static_cast<int>(hidden.size()) + 1);
     for (std::size_t k = 0; k < hidden.size(); ++k)
         if (static_cast<std::uint64_t>(made.layers[k].out) != hidden[k]) throw Error("its hidden layers are not those of its metadata");
     return made;

@@ -13,16 +13,28 @@
 
 namespace {
 
+void require(bool sound) {
+    if (!sound) std::abort();
+}
+
+bool sound(const nma::Vec3<float>& v, float pdf) {
+    for (const float x : {v.x, v.y, v.z, pdf})
+        if (!nma::is_finite(x) || x < 0.0f) return false;
+    return true;
+}
+
 // An adapter from these bytes is asked for a material, and refusal must be an `Error`. Returns whether it loaded.
 bool attempt(const std::uint8_t* data, std::size_t size) {
     try {
         const nma::Adapter adapter = nma::Adapter::from_memory(data, size);
-        const std::vector<float> parameters(adapter.parameter_count(), 0.5f);
+        std::vector<float> parameters(adapter.parameter_count(), 0.5f);
+        adapter.clamp(parameters.data());
+        require(adapter.check(parameters.data()) < 0);
         const nma::Direction wi{0.5196152f, 0.6928203f, 0.5f};
         const nma::Material material = adapter.prepare(parameters.data(), wi);
-        volatile float sink = material.eval(wi, {0.0f, 0.6f, 0.8f}).pdf;
-        sink = material.sample(wi, 0.3f, 0.4f, 0.5f).pdf;
-        (void)sink;
+        const nma::Value v = material.eval(wi, {0.0f, 0.6f, 0.8f});
+        const nma::Sampled s = material.sample(wi, 0.3f, 0.4f, 0.5f);
+        require(sound(v.value, v.pdf) && sound(s.value, s.pdf));
         return true;
     } catch (const nma::Error&) {
         return false;

@@ -33,7 +33,7 @@ private:
 void draw_parameters(const nma::Adapter& adapter, Random& random, float* to) {
     for (const nma::SourceParam& p : adapter.parameters())
         for (int c = 0; c < p.size; ++c) {
-            const float low = static_cast<float>(p.low), high = static_cast<float>(p.high > p.low ? p.high : 1.0), u = random();
+            const float low = static_cast<float>(p.low), high = static_cast<float>(p.high), u = random();
             *to++ = p.logarithmic ? low * std::pow(high / low, u) : low + (high - low) * u;
         }
 }
@@ -48,7 +48,7 @@ nma::Direction draw_direction(Random& random) {
 
 bool sound(const nma::Vec3<float>& v, float pdf) {
     for (const float x : {v.x, v.y, v.z, pdf})
-        if (!std::isfinite(x) || x < 0.0f) return false;
+        if (!nma::is_finite(x) || x < 0.0f) return false;
     return true;
 }
 
