@@ -327,4 +327,38 @@ inline float pdf(const Layers& layers, const Density& density, const Vec& wi, co
            density.diffuse * INV_PI<float> * wo.z;
 }
 
+// A direction with its density [1/sr]; a density of 0 marks an invalid one.
+struct Drawn {
+    Vec wo;
+    float pdf;
+};
+
+// A direction from `pdf` itself, by three uniform numbers in [0, 1). Its weight is `evaluate` over the density, which varies
+// more than a walk's throughput; but where samples of several materials are recombined by their densities, walks will not do:
+// no density is known that their directions follow.
+inline Drawn sample(const Layers& layers, const Density& density, const Vec& wi, float u_lobe, float u1, float u2) {
+    Vec wo;
+    if (u_lobe < density.coat) {
+        wo = sample_spec<float>(detail::above(wi), layers.alpha_top, layers.alpha_top, u1, u2);
+    } else if (u_lobe < density.coat + density.bottom) {
+        const Vec up = sample_spec<float>(density.inside, density.width, density.width, u1, u2);
+        const float x = up.x * layers.eta_top, y = up.y * layers.eta_top, z2 = 1.0f - x * x - y * y;
+        wo = {x, y, up.z > 0.0f ? safe_sqrt(z2) : 0.0f};
+    } else {
+        wo = sample_diffuse<float>(u1, u2);
+    }
+    return {wo, pdf(layers, density, wi, wo)};
+}
+
+// Directional albedo at `wi` (wi.z > 0), the mean of a fixed set of walks: the same for equal arguments, at most 1.
+inline Vec albedo(const Layers& layers, const Vec& wi, int walks = 256) {
+    Vec sum{0.0f, 0.0f, 0.0f};
+    for (int k = 0; k < walks; ++k) {
+        Random random(static_cast<std::uint64_t>(k), 0);
+        sum = sum + walk(layers, wi, random).throughput;
+    }
+    const float share = 1.0f / static_cast<float>(walks);
+    return {minimum(sum.x * share, 1.0f), minimum(sum.y * share, 1.0f), minimum(sum.z * share, 1.0f)};
+}
+
 }  // namespace nma::layered

@@ -1,0 +1,75 @@
+// Light of a small lamp that the simulated material itself reflects, and what its density is for.
+//
+//     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
+//     ./example_layered
+//
+// A walk leaves where the material sends it, and so seldom meets a small lamp; `evaluate` looks at the lamp, and so misses
+// what makes a narrow lobe bright. A path tracer does both and weighs each by the odds that the other finds the same light
+// (Veach 1997, eq. 9.8). That needs densities, and a walk has none in closed form; any will do, as long as both ways ask the
+// same: `pdf`, which is near the walk's, so that the weights are good. Samples that are recombined by densities, as in blends
+// and masks of materials, must follow the density to the letter: `sample` does.
+#include <cstdio>
+
+#include "nma/layered.h"
+
+namespace layered = nma::layered;
+using layered::Vec;
+
+// Gold under a red coat: the parameters of the class in CONVENTIONS.md.
+constexpr float GOLD[13] = {.01f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
+// A round lamp of radiance 1 that fills the directions within this cosine of its middle.
+constexpr float LAMP_COS = .95f;
+constexpr float LAMP_PDF = nma::INV_PI<float> / (2.0f * (1.0f - LAMP_COS));
+const Vec VIEW{.6f, 0.0f, .8f}, LAMP{-.8f, 0.0f, .6f};
+
+struct Estimate {
+    const char* name;
+    double sum = 0.0, squares = 0.0;
+
+    void add(const Vec& light) {
+        const double x = nma::luminance(light);
+        sum += x;
+        squares += x * x;
+    }
+    void print(int count) const {
+        const double mean = sum / count;
+        std::printf("%-28s %.5f +- %.5f\n", name, mean, std::sqrt((squares / count - mean * mean) / count));
+    }
+};
+
+bool lit(const Vec& wo) { return nma::dot(wo, LAMP) > LAMP_COS; }
+
+// A direction to the lamp, uniformly.
+Vec towards_lamp(float u1, float u2) {
+    const float z = 1.0f - u1 * (1.0f - LAMP_COS), r = nma::safe_sqrt(1.0f - z * z), phi = 2.0f * nma::PI<float> * u2;
+    const Vec across{LAMP.z, 0.0f, -LAMP.x};
+    return LAMP * z + across * (r * nma::cos(phi)) + Vec{0.0f, 1.0f, 0.0f} * (r * nma::sin(phi));
+}
+
+int main() {
+    const layered::Layers gold = layered::Layers::of(GOLD);
+    const layered::Density density(gold, VIEW);
+    layered::Random random(1, 1);
+    Estimate walks{"walks alone"}, lamp{"evaluate at the lamp alone"}, both{"both, weighed by pdf"}, exact{"sample, which follows pdf"};
+    constexpr int COUNT = 100000;
+    for (int k = 0; k < COUNT; ++k) {
+        const layered::Walk walk = layered::walk(gold, VIEW, random);
+        const Vec met = lit(walk.direction) ? walk.throughput : Vec{0.0f, 0.0f, 0.0f};
+
+        const Vec wo = towards_lamp(random.uniform(), random.uniform());
+        const Vec seen = layered::evaluate(gold, VIEW, wo, random) * (1.0f / LAMP_PDF);
+
+        // Odds that a direction within the lamp came from the walk rather than from the lamp.
+        const auto odds = [&](const Vec& w) { return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF); };
+        walks.add(met);
+        lamp.add(seen);
+        both.add(met * odds(walk.direction) + seen * (1.0f - odds(wo)));
+
+        const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
+        const layered::Drawn drawn = layered::sample(gold, density, VIEW, u_lobe, u1, u2);
+        const bool reaches = drawn.pdf > 0.0f && lit(drawn.wo);
+        exact.add(reaches ? layered::evaluate(gold, VIEW, drawn.wo, random) * (1.0f / drawn.pdf) : Vec{0.0f, 0.0f, 0.0f});
+    }
+    std::puts("luminance that the material sends to the viewer");
+    for (const Estimate* e : {&walks, &lamp, &both, &exact}) e->print(COUNT);
+}
