@@ -1,7 +1,7 @@
 """The C++ runtime from Python, for many queries at once: a compiled library, made when it is first wanted.
 
     runtime = nma.runtime.Runtime("layered3-5x64")
-    materials = runtime.prepare(params, wi)                    # (n, 13), (n, 3)
+    materials = runtime.prepare(params, wi)                    # (n, 13) in the training range, (n, 3)
     value, pdf = runtime.eval(materials, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
     wo, value, pdf = runtime.sample(materials, wi, u)
 
@@ -48,6 +48,8 @@ class Runtime:
 
     Attributes:
         parameters: numbers of a material that it takes, the columns of `params`.
+        names: the parameter that each column belongs to.
+        low, high: the training range of each column.
         size: numbers that the network returns.
         instruction_set: the one in use.
         anisotropic: whether the view's azimuth matters.
@@ -71,6 +73,8 @@ class Runtime:
             raise WeightsError(message.value.decode())
         self._handle = ctypes.c_void_p(handle)
         self.parameters = self._library.nma_parameter_count(self._handle)
+        self.names = [self._name(k) for k in range(self.parameters)]
+        self.low, self.high = self._ranges()
         self.size = self._library.nma_output_count(self._handle)
         self.anisotropic = bool(self._library.nma_anisotropic(self._handle))
         self.instruction_set = INSTRUCTION_SETS[self._library.nma_instruction_set(self._handle)]
@@ -79,36 +83,65 @@ class Runtime:
         if handle := getattr(self, "_handle", None):
             self._library.nma_free(handle)
 
-    def outputs(self, params: ArrayLike, wi: ArrayLike) -> Array:
+    def outputs(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
         """What the network returns, before decoding: (n, size). Arguments and errors are those of `prepare`."""
-        return self._many("nma_outputs", params, wi, self.size)
+        return self._many("nma_outputs", self._checked(params, clamp), wi, self.size)
 
-    def prepare(self, params: ArrayLike, wi: ArrayLike) -> Array:
+    def prepare(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
         """Materials for `eval` and `sample`, opaque rows.
 
         Args:
             params: (n, parameters), within the training range.
             wi: directions (n, 3), unit vectors above the horizon; or, for isotropic adapters, which look at nothing
                 else, their cosines (n,) in 0..1.
+            clamp: move parameters beyond the training range to it.
 
         Raises:
-            ParamError: other shapes, different lengths, or cosines for an anisotropic adapter.
+            ParamError: parameters beyond the training range, or not finite; other shapes, different lengths, or cosines
+                for an anisotropic adapter.
         """
-        return self._many("nma_prepare", params, wi, _MATERIAL)
+        return self._many("nma_prepare", self._checked(params, clamp), wi, _MATERIAL)
 
     def eval(self, materials: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
         """f cos(theta_o) [1/sr] (n, 3) and the density of `sample` [1/sr] (n,), both 0 below the horizon."""
-        found = self._each("nma_eval", materials, wi, wo, 4)
+        found = self._each("nma_eval", materials, wi, 4, wo)
         return found[:, :3], found[:, 3]
 
     def sample(self, materials: Array, wi: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
         """Directions (n, 3) drawn with uniform numbers (n, 3) in [0, 1), and `eval` of them; a density of 0 marks an
         invalid one."""
-        found = self._each("nma_sample", materials, wi, u, 7)
+        found = self._each("nma_sample", materials, wi, 7, u)
         return found[:, :3], found[:, 3:6], found[:, 6]
 
-    def _many(self, name: str, params: ArrayLike, wi: ArrayLike, width: int) -> Array:
-        rows, views = _rows("params", params, self.parameters), self._views(wi)
+    def albedo(self, materials: Array, wi: ArrayLike) -> Array:
+        """Directional albedos (n, 3) at `wi`, at most 1: the means over 128 fixed samples each, so without noise."""
+        return self._each("nma_albedo", materials, wi, 3)
+
+    def _name(self, column: int) -> str:
+        return self._library.nma_parameter_name(self._handle, column).decode()
+
+    def _ranges(self) -> tuple[Array, Array]:
+        """Lower and upper ends of all columns."""
+        ends = np.empty((self.parameters, 2), np.float32)
+        for column, pair in enumerate(ends):
+            self._library.nma_parameter_range(self._handle, column, _pointer(pair))
+        return ends[:, 0], ends[:, 1]
+
+    def _checked(self, params: ArrayLike, clamp: bool) -> Array:
+        """Rows of parameters within the training range."""
+        rows = _rows("params", params, self.parameters)
+        slack = 1e-6 * np.maximum(np.abs(self.low), 1.0)
+        inside = np.isfinite(rows) if clamp else (rows >= self.low - slack) & (rows <= self.high + slack)
+        if not inside.all():
+            row, column = np.argwhere(~inside)[0]
+            raise ParamError(
+                f"{self.names[column]} of row {row} is {rows[row, column]:g}, the adapter was trained on "
+                f"{self.low[column]:g} .. {self.high[column]:g}; `clamp` moves finite numbers there"
+            )
+        return np.clip(rows, self.low, self.high) if clamp else rows
+
+    def _many(self, name: str, rows: Array, wi: ArrayLike, width: int) -> Array:
+        views = self._views(wi)
         kind, suffix = ("cosines", "_many") if views.ndim == 1 else ("directions", "_direction_many")
         if len(rows) != len(views):
             raise ParamError(f"{len(rows)} rows of params for {len(views)} {kind}")
@@ -128,8 +161,9 @@ class Runtime:
             )
         return _rows("wi", wi)
 
-    def _each(self, name: str, materials: Array, first: ArrayLike, second: ArrayLike, width: int) -> Array:
-        arrays = _rows("materials", materials, _MATERIAL), _rows("wi", first, 3), _rows("wo or u", second, 3)
+    def _each(self, name: str, materials: Array, wi: ArrayLike, width: int, *more: ArrayLike) -> Array:
+        arrays = [_rows("materials", materials, _MATERIAL), _rows("wi", wi, 3)]
+        arrays += [_rows("wo or u", rows, 3) for rows in more]
         if len({len(array) for array in arrays}) > 1:
             raise ParamError(f"arrays of different lengths: {', '.join(str(len(a)) for a in arrays)}")
         found = np.empty((len(arrays[0]), width), np.float32)
@@ -155,4 +189,5 @@ def _library() -> ctypes.CDLL:
     loaded = ctypes.CDLL(str(native.library()))
     loaded.nma_load.restype = ctypes.c_void_p
     loaded.nma_load.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t]
+    loaded.nma_parameter_name.restype = ctypes.c_char_p
     return loaded

@@ -1,6 +1,7 @@
 // Neural Material Adapter: expensive materials rendered as blends of Principled BRDFs that a tiny network prepares.
 //
 //     const nma::Adapter adapter = nma::Adapter::load("layered3-5x64.safetensors");
+//     adapter.clamp(parameters);                                                 // or refuse them: adapter.check(parameters)
 //     const nma::Material at_hit = adapter.prepare(parameters, wi);              // once per shading point
 //     const nma::Value v = at_hit.eval(wi, wo);                                  // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = at_hit.sample(wi, u_lobe, u1, u2);
@@ -40,6 +41,19 @@ public:
         Sampled found = nma::sample(blend_, plane.enter(wi), u_lobe, u1, u2);
         found.wo = plane.leave(found.wo);
         return found;
+    }
+
+    // Directional albedo at `wi`, what denoisers ask for: the mean over samples at fixed points (Roberts 2018, "R2"), at most 1.
+    Vec3<float> albedo(const Direction& wi, int points = 128) const {
+        const auto fraction = [](float x) { return x - std::floor(x); };
+        Vec3<float> sum{0.0f, 0.0f, 0.0f};
+        for (int k = 0; k < points; ++k) {
+            const float n = static_cast<float>(k) + 0.5f;
+            const Sampled s = sample(wi, n / static_cast<float>(points), fraction(n * 0.75487767f), fraction(n * 0.56984029f));
+            if (s.pdf > 0.0f) sum = sum + s.value * (1.0f / s.pdf);
+        }
+        const float share = 1.0f / static_cast<float>(points);
+        return {minimum(sum.x * share, 1.0f), minimum(sum.y * share, 1.0f), minimum(sum.z * share, 1.0f)};
     }
 
     const Blend<float>& blend() const { return blend_; }
@@ -93,6 +107,19 @@ public:
     // Numbers that `prepare` takes, in the order of `parameters`.
     int parameter_count() const { return recipe_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
+    // The number of the first of them that is not finite or beyond its training range, where the network makes up plausible
+    // values; -1 if there is none. `parameter` says which parameter it belongs to.
+    int check(const float* parameters) const {
+        for (int k = 0; k < parameter_count(); ++k)
+            if (!parameter(k).allows(parameters[k])) return k;
+        return -1;
+    }
+    // Moves each into its training range, NaN to the lower end.
+    void clamp(float* parameters) const {
+        for (int k = 0; k < parameter_count(); ++k) parameters[k] = parameter(k).clamped(parameters[k]);
+    }
+    const SourceParam& parameter(int number) const { return weights_.parameters[owners_[number]]; }
+
     // Numbers that describe a blend, and what the network returns for them.
     int output_count() const { return recipe_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
@@ -157,6 +184,7 @@ private:
 
     Adapter(Weights weights, const Options& options) : weights_(std::move(weights)) {
         for (const TargetParam& p : weights_.target) add_fields(p);
+        for (std::size_t k = 0; k < weights_.parameters.size(); ++k) owners_.insert(owners_.end(), weights_.parameters[k].size, k);
         recipe_.encoding = Encoding(weights_);
         recipe_.instances = weights_.instances;
         recipe_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
@@ -253,6 +281,7 @@ private:
     Network network_;
     Recipe recipe_{};
     std::vector<int> fields_, lanes_;
+    std::vector<std::size_t> owners_;
     std::unique_ptr<float[], detail::FreeAligned> ranges_;
     bool in_plane_ = false;
 };

@@ -84,6 +84,14 @@ nma_adapter* nma_from_memory(const void* bytes, size_t length, int set, char* me
 void nma_free(nma_adapter* adapter) { delete adapter; }
 
 int nma_parameter_count(const nma_adapter* a) { return a->adapter.parameter_count(); }
+const char* nma_parameter_name(const nma_adapter* a, int number) { return a->adapter.parameter(number).name.c_str(); }
+void nma_parameter_range(const nma_adapter* a, int number, float range[2]) {
+    const nma::SourceParam& p = a->adapter.parameter(number);
+    range[0] = static_cast<float>(p.low);
+    range[1] = static_cast<float>(p.high);
+}
+int nma_check(const nma_adapter* a, const float* parameters) { return a->adapter.check(parameters); }
+void nma_clamp(const nma_adapter* a, float* parameters) { a->adapter.clamp(parameters); }
 int nma_output_count(const nma_adapter* a) { return a->adapter.output_count(); }
 int nma_instruction_set(const nma_adapter* a) { return static_cast<int>(a->adapter.instruction_set()) + NMA_PORTABLE; }
 int nma_anisotropic(const nma_adapter* a) { return a->adapter.anisotropic(); }
@@ -143,5 +151,12 @@ void nma_sample(int count, const nma_material* materials, const float* wi, const
         const nma::Sampled s = of(materials[k]).sample(direction(wi), u[0], u[1], u[2]);
         const float row[] = {s.wo.x, s.wo.y, s.wo.z, s.value.x, s.value.y, s.value.z, s.pdf};
         std::copy_n(row, 7, out);
+    }
+}
+
+void nma_albedo(int count, const nma_material* materials, const float* wi, float* out) {
+    for (int k = 0; k < count; ++k, wi += 3, out += 3) {
+        const nma::Vec3<float> albedo = of(materials[k]).albedo(direction(wi));
+        std::copy_n(&albedo.x, 3, out);
     }
 }

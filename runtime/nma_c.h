@@ -44,6 +44,13 @@ NMA_C_API nma_adapter* nma_from_memory(const void* bytes, size_t size, int instr
 NMA_C_API void nma_free(nma_adapter* adapter);
 
 NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
+/* Of the parameter number `number`, counted from 0: the parameter's name, and its training range, low and high. */
+NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int number);
+NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int number, float range[2]);
+/* The first number that is not finite or beyond its training range, where values are made up; -1 if there is none. */
+NMA_C_API int nma_check(const nma_adapter* adapter, const float* parameters);
+/* Moves each into its training range, NaN to the lower end. */
+NMA_C_API void nma_clamp(const nma_adapter* adapter, float* parameters);
 NMA_C_API int nma_output_count(const nma_adapter* adapter);
 NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
 /* Whether the view's azimuth matters. Cosines alone stand for the azimuth 0 then: give directions. */
@@ -69,6 +76,9 @@ NMA_C_API void nma_curves_free(nma_curves* curves);
  * before them, drawn with three uniform numbers in [0, 1) from `u`. A density of 0 marks an invalid direction. */
 NMA_C_API void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* value_pdf);
 NMA_C_API void nma_sample(int count, const nma_material* materials, const float* wi, const float* u, float* wo_value_pdf);
+
+/* For each material the directional albedo at `wi` as RGB, at most 1, without noise. */
+NMA_C_API void nma_albedo(int count, const nma_material* materials, const float* wi, float* albedo);
 
 #ifdef __cplusplus
 }
