@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nma import encoding, network, ops, weights
 from nma.encoding import Tangent
-from nma.errors import WeightsError
+from nma.errors import ParamError, WeightsError
 from nma.network import Layers
 from nma.ops import Float
 from nma.params import SPACES, ParamSpace
@@ -28,6 +28,9 @@ from nma.target.decode import (
     params_to_json,
 )
 from nma.target.principled import DIALECT
+
+# Parameters that differ by less, relative to their size, are of the same material: rounding to single precision.
+_SAME = 1e-5
 
 
 def shipped() -> tuple[str, ...]:
@@ -135,6 +138,39 @@ class Adapter:
         """Whether the blend holds in the plane of incidence (`nma.target.Plane`) instead of every local frame."""
         return any(p.in_plane for p in self.target)
 
+    @property
+    def material(self) -> NDArray[np.float64] | None:
+        """The parameters of the only material that the adapter knows, in the order of its class.
+
+        None where it knows the whole class, or where the class has no parameters to tell materials by.
+        """
+        fitted = self.training.get("params")
+        if not self.space.size or self.encoding not in encoding.SINGLE or fitted is None:
+            return None
+        return np.asarray(fitted, np.float64)
+
+    def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
+        """Returns `params` as float64 (n, columns), if the adapter knows such materials.
+
+        That of a class knows its training range, to which `clamp` moves them; that of a single material knows that one.
+        Raises `ParamError` for others.
+        """
+        known = self.material
+        if known is None:
+            return self.space.check(
+                params, "valid" if self.encoding in encoding.SINGLE else "training", clamp
+            )
+        given = self.space.check(params)
+        for name, columns in self.space.slices.items():
+            other = ~np.isclose(given[:, columns], known[columns], rtol=_SAME).all(axis=1)
+            if other.any():
+                raise ParamError(
+                    f"the adapter knows a single material, {self.training.get('material', 'that of its fit')}, whose "
+                    f"{name} is {_plain(known[columns])}, not {_plain(given[other][0, columns])}; fit one to that "
+                    "material, or take the adapter of a class"
+                )
+        return given
+
     def decode(self, raw: Sequence[Float], cos_theta_i: Float) -> Blend:
         """The blend that the network's outputs mean."""
         return self._bounded(decode(raw, self.instances, self.target, cos_theta_i), cos_theta_i)
@@ -177,6 +213,7 @@ class Adapter:
 
     def _check(self, path: Path, dialect: str) -> None:
         """Refuses a network that does not fit its own description, or this version's target."""
+        self._check_material(path)
         if dialect != DIALECT:
             raise WeightsError(
                 f"{path}: written for the Principled dialect '{dialect}', this version evaluates '{DIALECT}'"
@@ -199,3 +236,18 @@ class Adapter:
                 f"{path}: the network maps {found[0]} inputs to {found[1]} outputs, "
                 f"its description says {inputs} to {self.size}; train again"
             )
+
+    def _check_material(self, path: Path) -> None:
+        """Refuses a record of the only material known that is none of the class."""
+        try:
+            known = self.material
+            if known is not None and self.space.check(known).shape[1:] != known.shape:
+                raise ParamError(f"shape {known.shape}")
+        except (ValueError, TypeError) as e:
+            raise WeightsError(
+                f"{path}: its material is none of class {self.space.name} ({e}); fit it again"
+            ) from None
+
+
+def _plain(numbers: NDArray) -> str:
+    return ", ".join(f"{x:.6g}" for x in numbers)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ava, encoding, metrics, ops, target
+from nma import ava, metrics, ops, target
 from nma.adapter import Adapter
-from nma.errors import ParamError, TableError
+from nma.errors import TableError
 from nma.jit import dr
 from nma.ops import Vec3
 from nma.table import ISOTROPIC, Grid, Tables, bin_index
@@ -56,7 +56,7 @@ def tabulate_adapter(
     """
     if adapter.anisotropic:
         raise TableError("an anisotropic adapter has no isotropic table; compare it by pairs (nma.pairs)")
-    params = _known(adapter, params, clamp)
+    params = adapter.check(params, clamp)
     strata = np.arange(grid.theta_i * (directions or _DIRECTIONS))
     jitter = (strata * 0.6180339887 + 0.31 + shift) % 1.0
     mu = ((strata + jitter) / len(strata)).astype(np.float32)
@@ -67,17 +67,6 @@ def table_log_loss(adapter: Adapter, params: NDArray, table: NDArray, directions
     """The log loss (eq. 7) of one material (columns,) against its table, integrated once: quicker than `evaluate`."""
     own = tabulate_adapter(adapter, params[None], directions=directions)[0]
     return metrics.table_metrics(own, table, np.zeros_like(own))["log_loss"]
-
-
-def _known(adapter: Adapter, params: NDArray, clamp: bool) -> NDArray[np.float64]:
-    """The parameters, if the adapter was trained for such."""
-    if adapter.encoding not in encoding.SINGLE:
-        return adapter.space.check(params, "training", clamp)
-    params, fitted = adapter.space.check(params), adapter.training.get("params")
-    if fitted is not None and not np.allclose(params, fitted, rtol=1e-5):
-        known = adapter.training.get("material", "the one it was fitted to")
-        raise ParamError(f"the adapter knows a single material, {known}; the parameters are those of another")
-    return params
 
 
 def _tabulate(
@@ -173,7 +162,7 @@ def evaluate(
         )
     if not len(reference.params):
         raise TableError("the reference holds no material")
-    params = _known(adapter, reference.params, clamp)
+    params = adapter.check(reference.params, clamp)
     materials, spreads = [], []
     for n in range(len(params)):
         halves = [tabulate_adapter(adapter, params[n : n + 1], shift=s)[0] for s in (0.0, 0.5)]

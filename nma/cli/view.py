@@ -306,10 +306,18 @@ def _write_difference(path: Path, title: str, name: str, test: Any, reference: A
 
 def _material(name: str, changes: list[str] | None) -> Material:
     from nma import materials
+    from nma.adapter import Adapter
+    from nma.errors import ParamError
     from nma.params import MEASURED
 
     if name.endswith(".safetensors"):
         # An adapter that knows a single material is one.
+        adapter = Adapter.load(name)
+        if adapter.space.size and adapter.material is None:
+            raise ParamError(
+                f"{name} is an adapter of the whole class {adapter.space.name}; "
+                f"name a material, too: nma render MATERIAL --adapter {name}"
+            )
         return materials.Material(Path(name).stem, name, "", MEASURED.name, {})
     material = materials.load(name)
     return material.changed(dict(map(_change, changes)), "--set") if changes else material

@@ -7,6 +7,7 @@ wrap it in `twosided` if needed.
 
 Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond its training
 range are moved there instead of refused; and the parameters of the adapter's class, or a `material` that has them.
+One that knows a single material wants none, and refuses those of another.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from nma import target
 from nma.adapter import Adapter, shipped
 from nma.ops import Vec3
 from nma.render.curves import MIN_COS, Curves
-from nma.render.inputs import Inputs
+from nma.render.inputs import of_adapter
 from nma.render.layered import check_variant
 from nma.target import Blend, Plane
 
@@ -40,7 +41,7 @@ def define() -> type:
             # Weights lie beside the scene, as the files of Mitsuba's own plugins do.
             found = self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
             self.adapter = Adapter.load(found)
-            self.inputs = Inputs(self.adapter.space, props, "training", props.get("clamp", False))
+            self.inputs = of_adapter(self.adapter, props)
             self._curves = self._make_curves()
             self._last: Any = None
             self._attached = mi.Float(0.0)  # has a gradient wherever gradients are not suspended

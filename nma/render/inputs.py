@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import materials, ops
+from nma.adapter import Adapter
 from nma.errors import ParamError, TextureError
-from nma.params import Bounds, Param, ParamSpace
+from nma.params import MEASURED, Bounds, Param, ParamSpace
 from nma.render.scene import bitmap_texture
 
 
@@ -103,6 +104,34 @@ class Inputs:
             return value
         numbers = _check_numbers(param, value, self.bounds, self.clamp).tolist()
         return mi.Float(numbers[0]) if param.size == 1 else mi.Color3f(numbers)
+
+
+def of_adapter(adapter: Adapter, props: Any) -> Inputs:
+    """The inputs that an adapter has: the parameters of its class, or none where it knows a single material.
+
+    Parameters that are given all the same must be that material's. Raises `ParamError`.
+    """
+    clamp, known = props.get("clamp", False), adapter.material
+    if known is None:
+        return Inputs(adapter.space, props, "training", clamp)
+    given = _material_values(props["material"], adapter.space) if "material" in props else {}
+    given |= {param.name: _read(param, props) for param in adapter.space.params if param.name in props}
+    for param in adapter.space.params:
+        if param.name in given:
+            columns, value = adapter.space.slices[param.name], given[param.name]
+            adapter.check([*known[: columns.start], *_numbers(param, value), *known[columns.stop :]])
+    return Inputs(MEASURED, {}, "training")
+
+
+def _numbers(param: Param, value: Any) -> NDArray:
+    """A parameter's numbers; textures, which adapters of a single material do not look at, are refused."""
+    import mitsuba as mi
+
+    if isinstance(value, mi.Texture):
+        raise ParamError(
+            f"the adapter knows a single material, so that no texture can drive {param.name}; leave it out"
+        )
+    return _check_numbers(param, value, "valid", False)
 
 
 def _read(param: Param, props: Any) -> Any:

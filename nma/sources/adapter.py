@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import numpy as np
+from numpy.typing import ArrayLike
 
 from nma import target
 from nma.adapter import Adapter
-from nma.ops import Color, Float, Vec3
+from nma.ops import Color, Vec3
 from nma.target import Plane
 
 
 class AdapterValues:
-    """One material of an adapter (`Values`), of parameters `params`; an adapter of a single material has none."""
+    """One material of an adapter (`Values`), of parameters `params`, which one of a single material need not be told.
 
-    def __init__(self, adapter: Adapter, params: Sequence[Float] = (), name: str = "adapter"):
+    Raises `ParamError` for parameters that the adapter does not know.
+    """
+
+    def __init__(self, adapter: Adapter, params: ArrayLike = (), name: str = "adapter"):
         self.adapter, self.name = adapter, name
-        self.params = adapter.space.check([params] if len(params) else [[]])[0].tolist()
+        given = np.asarray(params, np.float64)
+        if not given.size and adapter.material is not None:
+            given = adapter.material
+        self.params = adapter.check(given[None])[0].tolist()
         self.isotropic = not adapter.anisotropic
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
