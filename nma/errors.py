@@ -1,6 +1,10 @@
 """Errors that users meet. Each message says what is wrong, where, and what to do next."""
 
 import re
+import textwrap
+
+_TRACEBACK = "Traceback (most recent call last):"
+_LONGEST = 600  # letters of an error that prints whole objects
 
 
 class NmaError(Exception):
@@ -47,7 +51,11 @@ def one_line(message: str) -> str:
     """Mitsuba's error: where, and what is wrong, without lines of source code; of a traceback only the error."""
     message = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip())
     message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
-    head, traceback, rest = message.partition("Traceback (most recent call last):")
+    head, traceback, _ = message.partition(_TRACEBACK)
     if traceback:
-        message = head + re.sub(r"^[\w.]+: ", "", rest.strip().splitlines()[-1])
-    return " ".join(message.split())
+        # Lines of a traceback are indented; what follows is the error, of one line or more.
+        error = re.search(
+            r"^(?!\s)(?:[\w.]+: )?(.*)", message.rpartition(_TRACEBACK)[2].lstrip("\n"), re.M | re.S
+        )
+        message = head + (error[1] if error else "")
+    return textwrap.shorten(message, _LONGEST, placeholder=" ...")

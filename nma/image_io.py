@@ -160,8 +160,13 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
 
 
 def coloured_layer(bitmap: Any) -> Any:
-    """The first layer with red, green and blue, else the bitmap itself."""
+    """The first layer with red, green and blue, else the first one of a picture in grey or XYZ, else the bitmap."""
     import mitsuba as mi
 
-    formats = (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA)
-    return next((layer for _, layer in bitmap.split() if layer.pixel_format() in formats), bitmap)
+    kinds = mi.Bitmap.PixelFormat
+    layers = [layer for _, layer in bitmap.split()]
+    for formats in ((kinds.RGB, kinds.RGBA), (kinds.Y, kinds.YA, kinds.XYZ, kinds.XYZA)):
+        for layer in layers:
+            if layer.pixel_format() in formats:
+                return layer
+    return bitmap

@@ -13,6 +13,7 @@ import typer
 
 from nma import files
 from nma.cli import console, options
+from nma.errors import ParamError
 
 if TYPE_CHECKING:
     from nma.materials import Material
@@ -279,17 +280,11 @@ def _samples_bar(title: str, total: int):
 def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float) -> None:
     """All channels as EXR, the colours as PNG."""
     from nma.image_io import write_exr, write_png
+    from nma.render.channels import channel_names, colours
 
-    layers = [layer.name for layer in scene.sensors()[0].film().bitmap().struct_()]
-    write_exr(pictures[0], image, layers if image.shape[2] > 4 else ())
-    colours = (
-        image[..., :3]
-        if image.shape[2] > 3
-        else image[..., :1].repeat(3, axis=2)
-        if image.shape[2] == 1
-        else image
-    )
-    write_png(pictures[1], colours, exposure=exposure)
+    names = channel_names(scene, image.shape[2])
+    write_exr(pictures[0], image, names)
+    write_png(pictures[1], colours(image, names), exposure=exposure)
     console.err.print(f"{pictures[0]} (linear), {pictures[1]}")
 
 
@@ -357,10 +352,17 @@ def _assignment(text: str) -> tuple[str, str]:
 
 def _pixels(text: str) -> tuple[int, int]:
     """Width and height from `512` or `512x384`."""
-    parts = text.lower().split("x")
-    if len(parts) > 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
+    from nma.render.progressive import check_size
+
+    found = re.fullmatch(r"([1-9]\d{0,8})(?:x([1-9]\d{0,8}))?", text.lower(), re.ASCII)
+    if found is None:
         raise typer.BadParameter(f"size '{text}' is neither a number of pixels nor WIDTHxHEIGHT")
-    return int(parts[0]), int(parts[-1])
+    size = int(found[1]), int(found[2] or found[1])
+    try:
+        check_size(size)
+    except ParamError as error:
+        raise typer.BadParameter(str(error)) from None
+    return size
 
 
 def _outputs(path: Path) -> tuple[Path, Path]:

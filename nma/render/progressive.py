@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError
+from nma.image_size import MOST_PIXELS
 
 # Samples of one pass over the whole picture: a second or so on two cores, and a bound on memory.
 SAMPLES_PER_PASS = 1 << 20
@@ -32,20 +33,30 @@ def render_passes(
         progress: called after each pass with its samples per pixel.
 
     Raises:
-        ParamError: spp below 1.
+        ParamError: spp below 1, or more pixels than `MOST_PIXELS`.
     """
     import mitsuba as mi
 
     if spp < 1:
         raise ParamError(f"{spp} samples per pixel; take at least 1")
-    width, height = scene.sensors()[sensor].film().crop_size()
-    passes = pass_sizes(spp, int(width) * int(height))
+    width, height = map(int, scene.sensors()[sensor].film().crop_size())
+    check_size((width, height))
+    passes = pass_sizes(spp, width * height)
     total = np.zeros(())
     for number, samples in enumerate(passes):
         image = mi.render(scene, sensor=sensor, spp=samples, seed=_pass_seed(seed, number))  # type: ignore[arg-type]
         total = total + samples * np.array(image, dtype=np.float64)
         progress(samples)
     return (total / spp).astype(np.float32)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Refuses pictures that are too large, before they take memory. Raises `ParamError`."""
+    if size[0] * size[1] > MOST_PIXELS:
+        raise ParamError(
+            f"a picture of {size[0]} x {size[1]} pixels is too large; at most {MOST_PIXELS:,} are rendered, "
+            "16384 x 8192 for example"
+        )
 
 
 def pass_sizes(spp: int, pixels: int) -> list[int]:
