@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -71,7 +72,7 @@ class Adapter:
     def load(name_or_path: str | Path) -> Adapter:
         """A shipped adapter by name, or one from a weights file. Raises `WeightsError`."""
         path = weights_file(name_or_path)
-        if path.suffix != ".safetensors" and not path.exists():
+        if path.suffix != ".safetensors" and not os.path.exists(path):
             raise WeightsError(
                 f"'{name_or_path}' is neither a file nor a shipped adapter ({', '.join(shipped())})"
             )

@@ -7,6 +7,7 @@ more. The header's metadata has one entry, `nma`, a JSON object with the fields 
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -71,7 +72,7 @@ def write(
 def read(path: str | Path) -> tuple[Header, Layers]:
     """Header and layers of a weights file; `WeightsError` says what is wrong with it."""
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise WeightsError(f"{path}: no such weights file; `nma train` or `nma fit` writes one")
     try:
         with safe_open(path, framework="numpy") as f:

@@ -237,6 +237,10 @@ def changed(fields, **others):
         ({"theta_i": np.zeros(7, np.float32)}, r"field 'vndf' has shape \(1, 8,"),
         ({"ndf": np.zeros(128, np.float32)}, "field 'ndf' has shape .*, not 2 dimensions"),
         ({"sigma": np.full((2, 128), np.nan, np.float32)}, "field 'sigma' is not finite"),
+        ({"theta_i": np.linspace(1.5, 0.0, 8, dtype=np.float32)}, "field 'theta_i' does not ascend"),
+        ({"theta_i": np.full(8, 0.5, np.float32)}, "field 'theta_i' does not ascend"),
+        ({"theta_i": np.linspace(0.0, 90.0, 8, dtype=np.float32)}, r"does not ascend within 0 \.\. 1\.571"),
+        ({"phi_i": np.array([1e6], np.float32)}, "field 'phi_i' does not ascend within"),
     ],
 )
 def test_a_material_without_its_fields_is_refused(bsdf_file, tmp_path, change, message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def load_scene(
     """
     import mitsuba as mi
 
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise SceneError(f"there is no scene file {path}")
     try:
         scene = mi.load_file(str(path), **dict(define or {}))  # type: ignore[arg-type]

@@ -53,11 +53,13 @@ def _xml(path: Path, material: str | None) -> Values:
 
 
 def _nbrdf(path: Path, material: str | None) -> Values:
-    from nma.sources.nbrdf import Nbrdf
+    from nma.sources import nbrdf
 
     if material is None:
-        raise SourceError(f"{path}: holds the networks of many materials; say which")
-    return Nbrdf.load(path, material)
+        names, _ = nbrdf.read(path)
+        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        raise SourceError(f"{path}: holds the networks of {len(names)} material(s); say which: {listed}")
+    return nbrdf.Nbrdf.load(path, material)
 
 
 # How a file is read, by the end of its name; `material` chooses in files that hold several.

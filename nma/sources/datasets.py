@@ -6,6 +6,7 @@ Nothing is downloaded. Their terms decide what a user may do with them, and with
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,7 +118,7 @@ def check(path: str | Path) -> Iterator[Finding]:
     Raises `SourceError` where there is nothing to look at.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         raise SourceError(f"{path}: no such file or folder")
     if path.is_file():
         yield _check_file(path)

@@ -13,5 +13,5 @@ def content(path: Path, dataset: str) -> bytes:
         return path.read_bytes()
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; see `nma data` for where {dataset}'s come from") from None
-    except OSError as e:
-        raise SourceError(f"{path}: cannot be read: {e.strerror}") from None
+    except (OSError, ValueError) as e:  # a name may be too long for a file, or hold a NUL
+        raise SourceError(f"{path}: cannot be read: {getattr(e, 'strerror', e)}") from None

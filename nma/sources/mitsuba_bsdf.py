@@ -6,6 +6,7 @@ out. A perfectly specular lobe has no value at a pair of directions, so BSDFs th
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,9 @@ from nma.sources.base import direction
 # Pairs of directions that tell whether a BSDF is isotropic, and the relative change that rounding explains.
 _PAIRS = 512
 _ROUNDING = 1e-3
+# Directions closer to the horizon are taken for ones of this cosine. If both lie there, on opposite sides, nothing is
+# left of their half vector in single precision, and Mitsuba's measured and rough BSDFs are NaN.
+_MIN_COS = 1e-6
 
 
 class MitsubaBsdf:
@@ -59,8 +63,9 @@ class MitsubaBsdf:
             )
         with dr.suspend_grad():
             active = mi.Bool((wi.z > 0) & (wo.z > 0))
-            si = _interaction(mi, mi.Vector3f(*wi), self._uv)
-            value = self.bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo), active)
+            lifted_wi, lifted_wo = (mi.Vector3f(w.x, w.y, dr.maximum(w.z, _MIN_COS)) for w in (wi, wo))
+            si = _interaction(mi, lifted_wi, self._uv)
+            value = self.bsdf.eval(mi.BSDFContext(), si, lifted_wo, active)
             value = dr.select(active, value, 0.0)
             plain = [dr.detach(c, preserve_type=False) for c in value]
         return Color(*(type(wi.z)(c) for c in plain))
@@ -89,7 +94,7 @@ def from_dict(description: Mapping[str, Any], name: str | None = None, **options
 def from_xml(path: str | Path, **options: Any) -> MitsubaBsdf:
     """The BSDF of an XML file whose outermost element is <bsdf>; `options` as `MitsubaBsdf` takes them."""
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise SourceError(f"{path}: no such file")
     for filename in _measured_in_xml(path.read_bytes()):
         # Names are relative to the file that has them.

@@ -61,6 +61,8 @@ def read(path: str | Path) -> dict[str, NDArray]:
         if fields[name].dtype.kind == "f" and not np.isfinite(fields[name]).all():
             raise SourceError(f"{path}: field '{name}' is not finite; copy the file again")
     _check_shapes(path, fields)
+    for name, low, high in (("phi_i", -2 * math.pi, 2 * math.pi), ("theta_i", 0.0, math.pi / 2)):
+        _check_grid(path, name, fields[name], low, high)
     return fields
 
 
@@ -109,3 +111,17 @@ def _check_shapes(path: Path, fields: dict[str, NDArray]) -> None:
             raise SourceError(
                 f"{path}: field '{name}' has shape {fields[name].shape}, the others want {shape}; copy it again"
             )
+
+
+def _check_grid(path: Path, name: str, angles: NDArray, low: float, high: float) -> None:
+    """Refuses angles of incidence that do not ascend, among which Mitsuba searches by halves, or that make no sense."""
+    slack = 1e-4
+    if not (
+        len(angles)
+        and (np.diff(angles) > 0).all()
+        and low - slack <= angles[0]
+        and angles[-1] <= high + slack
+    ):
+        raise SourceError(
+            f"{path}: field '{name}' does not ascend within {low:.4g} .. {high:.4g}; copy the file again"
+        )
