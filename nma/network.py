@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,6 +16,9 @@ from nma.ops import Float
 
 # Share of He's random matrix in hidden layers that start near the identity.
 _MIXING = 0.25
+
+# Far beyond what a renderer can run for each shading point.
+_MOST_LAYERS, _MOST_NEURONS = 64, 1024
 
 Layers = list[tuple[Any, Any]]  # (matrix (out, in), bias (out,)) per layer
 _Activation = Callable[[Float], Float]
@@ -139,7 +143,11 @@ def parameters(layers: Layers) -> int:
 
 def hidden(name: str) -> list[int]:
     """Hidden layer sizes of a network named like "5x64"."""
-    depth, _, width = name.partition("x")
-    if not (depth.isdigit() and width.isdigit() and int(depth) > 0 and int(width) > 0):
-        raise NmaError(f"a network is written as DEPTHxWIDTH, for example 5x64; got '{name}'")
-    return [int(width)] * int(depth)
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", name, re.ASCII)
+    depth, width = (int(number) for number in found.groups()) if found else (0, 0)
+    if not (0 < depth <= _MOST_LAYERS and 0 < width <= _MOST_NEURONS):
+        raise NmaError(
+            f"a network is written as DEPTHxWIDTH, for example 5x64, at most {_MOST_LAYERS}x{_MOST_NEURONS}; "
+            f"got '{name}'"
+        )
+    return [width] * depth

@@ -8,7 +8,7 @@ from PIL import Image
 
 import nma.render
 from nma import materials
-from nma.errors import ParamError
+from nma.errors import MissingDependencyError, ParamError
 from nma.render.load import SceneError, load_dict, load_scene, material_bsdf
 from nma.render.progressive import SAMPLES_PER_PASS, pass_sizes, render_passes
 from nma.render.scene import preview_scene
@@ -120,6 +120,14 @@ def test_textures_of_eight_bits_are_what_they_evaluate_to(model, tmp_path):
     Image.fromarray(np.zeros((4, 4), np.uint8)).save(tmp_path / "grey.png")
     with pytest.raises(SceneError, match="texture of alpha_top.* holds 0.0 at x=0, y=0"):
         load_dict(bsdf | {"alpha_top": bitmap})
+
+
+@pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="there is an NVIDIA GPU")
+def test_variants_for_a_device_that_is_not_there_are_refused():
+    with pytest.raises(
+        MissingDependencyError, match="cuda_ad_rgb needs an NVIDIA GPU.*llvm_ad_rgb needs none"
+    ):
+        nma.render.use("cuda_ad_rgb")
 
 
 def test_unknown_variants_are_refused():

@@ -85,6 +85,8 @@ def train(
 
     checkpoint = output.with_name(output.name + ".ckpt")
     files.try_file(output, checkpoint, console.loss_plot(output))
+    if preset not in ("class", "paper"):
+        raise typer.BadParameter(f"preset must be class or paper, got '{preset}'")
     lobes, directional = _variant(variant)
     recipe = recipes.preset(
         preset,

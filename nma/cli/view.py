@@ -192,11 +192,10 @@ def demo(
 
     image_metrics.ensure_libraries()
     files.try_file(output)
-    import nma.render
     from nma.render import demo as demonstration
 
     settings = demonstration.Settings(_pixels(size), spp, runs, reference_spp, adapter)
-    nma.render.use(variant)
+    _use_rgb(variant)
     with _samples_bar("demo", demonstration.total_samples(settings)) as advance:
         lines = demonstration.demo(output, settings, advance)
     for material in dict.fromkeys(line.material for line in lines):
@@ -221,13 +220,21 @@ class _View(NamedTuple):
 
     def load(self, material: Material, model: str, adapter: str = "", clamp: bool = False) -> Any:
         """The scene with this material."""
-        import nma.render
         from nma.render import load, scene
 
-        nma.render.use(self.variant)
+        _use_rgb(self.variant)
         bsdf = load.material_bsdf(material, model, adapter=adapter, clamp=clamp)
         options: dict[str, Any] = {"camera": self.camera, "envmap": self.envmap, "max_depth": self.depth}
         return load.load_dict(scene.preview_scene(bsdf, size=self.size, spp=self.spp, **options))
+
+
+def _use_rgb(variant: str) -> None:
+    """Chooses the variant for materials, whose parameters are RGB."""
+    import nma.render
+
+    if not variant.endswith("_rgb") and variant != "auto":
+        raise ParamError(f"materials are rendered in RGB, not by {variant}; take llvm_ad_rgb or cuda_ad_rgb")
+    nma.render.use(variant)
 
 
 def _load_file(

@@ -11,7 +11,7 @@ They exist in the variant in use and in every one chosen later, so the order of 
 from __future__ import annotations
 
 from nma import native
-from nma.errors import ParamError
+from nma.errors import MissingDependencyError, ParamError
 from nma.jit import dr
 from nma.llvm import ensure_llvm
 from nma.render import register as _plugins
@@ -30,7 +30,8 @@ def use(variant: str = "auto") -> str:
 
     Raises:
         ParamError: Mitsuba has no such variant.
-        MissingDependencyError: the variant needs libLLVM, and it is missing or too old; or a C++ compiler.
+        MissingDependencyError: the variant needs libLLVM, and it is missing or too old; or a C++ compiler, or an
+            NVIDIA GPU.
     """
     import mitsuba as mi
 
@@ -38,6 +39,10 @@ def use(variant: str = "auto") -> str:
         variant = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
     if variant not in mi.variants():
         raise ParamError(f"Mitsuba has no variant {variant!r}; it has {', '.join(mi.variants())}")
+    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise MissingDependencyError(
+            f"{variant} needs an NVIDIA GPU and its driver, `nma doctor` says what is missing; llvm_ad_rgb needs none"
+        )
     if variant.startswith("llvm"):
         ensure_llvm()
     if variant == "scalar_rgb":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
+from nma import network
 from nma.ava import FINEST
 from nma.errors import NmaError
 from nma.table import ISOTROPIC, Grid
@@ -65,6 +66,8 @@ class Recipe:
         for name in positive:
             if not getattr(self, name) > 0:
                 raise NmaError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.network != "none":
+            network.hidden(self.network)
         for name, hint in get_type_hints(Recipe).items():
             if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
                 raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
