@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nma
+import nma.render.lighting
 import nma.render.scene
 import nma.render.textures
 from nma.materials import Material
+from nma.render.lighting import LAMP_RADIANCE
 from nma.render.load import material_bsdf
-from nma.render.scene import LAMP_RADIANCE, Camera, bitmap_texture, preview_scene
+from nma.render.scene import Camera, bitmap_texture, preview_scene
 from nma.render.shaderball import shader_ball_file
 from nma.render.textures import periodic_noise, procedural_textures
 
@@ -135,8 +137,8 @@ TEXTURED: dict[str, Callable[[], Subject]] = {
 
 
 def preview(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
-    """The preview scene: sun, sky and a lamp."""
-    return preview_scene(bsdf, size=size, integrator=_path(rr_depth))
+    """The preview scene outdoors: sun, sky and a lamp."""
+    return preview_scene(bsdf, size=size, integrator=_path(rr_depth), lighting="outdoors")
 
 
 def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
@@ -150,7 +152,8 @@ def sphere(
     bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH, hide_sun: bool = False
 ) -> dict[str, Any]:
     """A sphere that fills the picture under sun and sky, one environment map: the material dominates the time."""
-    scene = preview_scene(bsdf, size=size, integrator=_path(rr_depth), hide_sun=hide_sun)
+    options = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": hide_sun}
+    scene = preview_scene(bsdf, size=size, **options)
     del scene["floor"], scene["lamp"]
     scene["sensor"]["fov"] = 19.0
     ball = {"type": "sphere", "center": [0.0, 0.0, 1.0], "radius": 1.0}
@@ -181,9 +184,8 @@ def teaser(
     import mitsuba as mi
 
     subjects = [make() for make in TEXTURED.values()]
-    scene = preview_scene(
-        model(subjects[0]), size=size, integrator=_path(rr_depth), camera=WIDE, hide_sun=True
-    )
+    options = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": True}
+    scene = preview_scene(model(subjects[0]), size=size, camera=WIDE, **options)
     scene["lamp"]["to_world"] = (
         mi.ScalarTransform4f()
         .look_at(list(SOFT_BOX_PLACE), [0.0, 0.0, 0.9], [0.0, 0.0, 1.0])
@@ -207,7 +209,8 @@ def teaser_size(height: int) -> tuple[int, int]:
 
 def digest() -> str:
     """Names pictures that are kept: another scene has other ones."""
-    files = [__file__, *(module.__file__ for module in (nma.render.scene, nma.render.textures))]
+    modules = (nma.render.scene, nma.render.lighting, nma.render.textures)
+    files = [__file__, *(module.__file__ for module in modules)]
     return hashlib.sha256(b"".join(Path(str(file)).read_bytes() for file in files)).hexdigest()[:8]
 
 

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import nma
 from nma.materials import Material
+from nma.render.lighting import LAMP_RADIANCE
 from nma.render.load import load_dict
 from nma.render.progressive import render_passes
-from nma.render.scene import LAMP_RADIANCE
 
 # The soft box's side in those of the scene's lamp.
 SOFT_BOX = 7
@@ -44,7 +44,7 @@ def render(
 def scene(bsdf: dict[str, Any], size: int, sampler: str = "independent") -> dict[str, Any]:
     """The preview scene under a sky without a sun and a soft box in place of the lamp, with one bounce of light: the
     noise of small lights and caustics would hide what tells adapters apart."""
-    made = nma.preview_scene(bsdf, size=(size, size), hide_sun=True, max_depth=3)
+    made = nma.preview_scene(bsdf, size=(size, size), lighting="outdoors", hide_sun=True, max_depth=3)
     made["sensor"]["sampler"]["type"] = sampler
     made["lamp"]["to_world"] = made["lamp"]["to_world"].scale(SOFT_BOX)
     radiance = [value / SOFT_BOX**2 for value in LAMP_RADIANCE]

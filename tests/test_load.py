@@ -29,7 +29,7 @@ def test_passes_add_up_and_stay_small(spp, pixels):
 
 def test_passes_average_to_one_picture_and_equal_seeds_repeat_it(monkeypatch):
     monkeypatch.setattr("nma.render.progressive.SAMPLES_PER_PASS", 12 * 12 * 2)
-    scene = load_dict(preview_scene({"type": "diffuse"}, size=(12, 12), spp=1, hide_sun=True))
+    scene = load_dict(preview_scene({"type": "diffuse"}, size=(12, 12), spp=1))
     done = []
     image = render_passes(scene, 5, seed=3, progress=done.append)
     assert done == [2, 2, 1]

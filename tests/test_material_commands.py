@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from nma import materials
-from nma.cli.view import _change
+from nma.cli.preview import read_change
 from nma.errors import MaterialError
 
 HEAD = 'class = "layered3"\n[parameters]\nalpha_top = 0.01\neta_top = 1.5\nconductor = "Au"\nalbedo = 0.5\n'
@@ -74,12 +74,12 @@ def test_a_material_is_shown_as_a_table_whatever_its_title(nma, textured):
     ],
 )
 def test_set_says_what_a_material_file_does(text, change):
-    assert _change(text) == change
+    assert read_change(text) == change
 
 
 def test_a_coloured_image_may_be_set_by_a_channel(textured):
-    name, value = _change(f"sigma_t={textured.parent / 'orm.png'},channel=r")
+    name, value = read_change(f"sigma_t={textured.parent / 'orm.png'},channel=r")
     changed = materials.load(textured).changed({name: value}, "--set")
     np.testing.assert_array_equal(changed.textures["sigma_t"].read(), 1.0)
     with pytest.raises(MaterialError, match="--set, sigma_t: channel is 'x'"):
-        changed.changed(dict([_change(f"sigma_t={textured.parent / 'orm.png'},channel=x")]), "--set")
+        changed.changed(dict([read_change(f"sigma_t={textured.parent / 'orm.png'},channel=x")]), "--set")

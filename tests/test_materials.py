@@ -415,3 +415,10 @@ def test_a_vector_becomes_a_material_and_back():
     np.testing.assert_allclose(material.vector(), vector)
     assert material.title == "Drawn 1"
     assert isinstance(material.values["albedo"], tuple)
+
+
+@pytest.mark.parametrize("name", materials.names())
+def test_descriptions_promise_nothing_that_the_classes_lack(name):
+    """Isotropic and homogeneous layers show neither brushing nor flakes."""
+    text = materials.load(name).description.lower()
+    assert not [word for word in ("brush", "flake", "spark", "scratch", "grain", "fibre") if word in text]

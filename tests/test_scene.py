@@ -15,6 +15,7 @@ import mitsuba as mi  # noqa: E402
 mi.set_variant("llvm_ad_rgb")
 
 from nma.render import measure as measuring  # noqa: E402
+from nma.render.lighting import LIGHTINGS  # noqa: E402
 from nma.render.scene import CAMERAS, Camera, bitmap_texture, material_coverage, preview_scene  # noqa: E402
 from nma.render.shaderball import shader_ball, shader_ball_file  # noqa: E402
 from nma.render.textures import procedural_textures  # noqa: E402
@@ -72,7 +73,9 @@ def test_material_covers_forty_percent(name):
 
 
 def test_parameters_keep_their_names():
-    keys = mi.traverse(mi.load_dict(preview_scene(GREY | {"id": "mine"}, size=(8, 8)))).keys()
+    keys = mi.traverse(
+        mi.load_dict(preview_scene(GREY | {"id": "mine"}, size=(8, 8), lighting="outdoors"))
+    ).keys()
     assert "material.reflectance.value" in keys
     assert {
         "sky.data",
@@ -82,9 +85,10 @@ def test_parameters_keep_their_names():
     } <= set(keys)
 
 
-def test_picture_is_well_exposed():
+@pytest.mark.parametrize("lighting", LIGHTINGS)
+def test_picture_is_well_exposed(lighting):
     """Mean luminance near middle grey, few pixels beyond white, no dead pixel."""
-    image = render(preview_scene(GREY, size=(64, 64)), 32)
+    image = render(preview_scene(GREY, size=(64, 64), lighting=lighting), 32)
     assert np.isfinite(image).all()
     assert image.min() >= 0.0
     assert 0.15 < image.mean() < 0.45
@@ -92,7 +96,8 @@ def test_picture_is_well_exposed():
 
 
 def test_horizon_is_soft_and_the_sun_can_be_hidden():
-    scenes = [mi.load_dict(preview_scene(GREY, size=(8, 8), hide_sun=hide)) for hide in (False, True)]
+    outdoors = {"size": (8, 8), "lighting": "outdoors"}
+    scenes = [mi.load_dict(preview_scene(GREY, **outdoors, hide_sun=hide)) for hide in (False, True)]
     peaks = [float(np.array(mi.traverse(scene)["sky.data"]).max()) for scene in scenes]
     assert peaks[0] > 50.0 * peaks[1]
     sky = np.array(mi.traverse(scenes[1])["sky.data"])[..., :3].mean(axis=1)
@@ -220,7 +225,7 @@ def test_ztest_false_alarms_are_as_stated():
 
 def test_ztest_of_renders_accepts_equal_and_rejects_two_percent_of_energy():
     """A 24 x 24 picture, 12 runs of 32 samples on either side. False alarm 1 % before fixing the seeds."""
-    scene = mi.load_dict(preview_scene(GREY, size=(24, 24), hide_sun=True))
+    scene = mi.load_dict(preview_scene(GREY, size=(24, 24)))
     one = measuring.measure(scene, 32, range(12), warmup=False)
     two = measuring.measure(scene, 32, range(100, 112), warmup=False)
     for block in (1, 8):

@@ -126,5 +126,5 @@ def _render(bsdf: dict[str, Any], params: np.ndarray, spp: int) -> np.ndarray:
     for name, columns in nma.LAYERED3.slices.items():
         value = params[columns].tolist()
         values[name] = value[0] if len(value) == 1 else {"type": "rgb", "value": value}
-    scene = load_dict(nma.preview_scene({**bsdf, **values}, size=(144, 144)))
+    scene = load_dict(nma.preview_scene({**bsdf, **values}, size=(144, 144), lighting="outdoors"))
     return render_passes(scene, spp)

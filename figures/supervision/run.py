@@ -122,7 +122,7 @@ def render_adapter(material: Material, adapter: nma.Adapter, effort: Effort) -> 
 
 def render(bsdf: dict, effort: Effort, spp: int) -> NDArray[np.float32]:
     """The preview scene around a BSDF."""
-    scene = nma.preview_scene(bsdf, size=(effort.size, effort.size))
+    scene = nma.preview_scene(bsdf, size=(effort.size, effort.size), lighting="outdoors")
     return render_passes(load_dict(scene), spp)
 
 

@@ -90,6 +90,7 @@ def render(textures: dict[str, Any], adapter: str, size: Size) -> Step:
                 material_bsdf(material, model, adapter=adapter) | textures,
                 size=(size.pixels, size.pixels),
                 max_depth=DEPTH,
+                lighting="outdoors",
             )
         )
         for model in ("layered", "nma")

@@ -7,12 +7,13 @@ import re
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from nma import files
 from nma.cli import console, options
+from nma.cli.preview import View, assignment, read_material, use_rgb
 from nma.errors import ParamError
 
 if TYPE_CHECKING:
@@ -33,7 +34,10 @@ _Clamp = Annotated[
 ]
 _Camera = Annotated[str, typer.Option(help="hero, close or top.")]
 _Envmap = Annotated[
-    Path | None, typer.Option(help="Light by this environment map (EXR or HDR) instead of sun, sky and lamp.")
+    Path | None, typer.Option(help="Light by this environment map (EXR or HDR), instead of --lighting.")
+]
+_Lighting = Annotated[
+    str, typer.Option(help="studio, softboxes in a dim dome, or outdoors, sun, sky and a small lamp.")
 ]
 _Size = Annotated[str, typer.Option(help="Pixels: 512 for a square, or 512x384.")]
 _Depth = Annotated[int, options.number("Longest path, in edges.", 1, 1000)]
@@ -72,7 +76,13 @@ def render(
     clamp: _Clamp = False,
     changes: _Set = None,
     camera: _Camera = "hero",
+    lighting: _Lighting = "studio",
     envmap: _Envmap = None,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="Show this mesh (PLY or OBJ) in place of the ball, on the floor and as large."),
+    ] = None,
+    mesh_up: Annotated[str, typer.Option(help="The axis of the mesh that points up: z or y.")] = "z",
     size: Annotated[
         str | None,
         typer.Option(help="Pixels: 512 for a square, or 512x384.", show_default="512, or the scene's"),
@@ -83,6 +93,15 @@ def render(
     depth: _Depth = 6,
     seed: _Seed = 0,
     exposure: Annotated[float, options.exposure("Stops that brighten the PNG; the EXR stays linear.")] = 0.0,
+    clamp_samples: Annotated[
+        float | None,
+        options.number(
+            "Scale samples brighter than this radiance down to it, against fireflies; try 10. It darkens the picture.",
+            1e-3,
+            1e6,
+            show_default="none",
+        ),
+    ] = None,
     define: Annotated[
         list[str] | None,
         typer.Option(
@@ -111,15 +130,18 @@ def render(
         spp = spp or own_spp
     else:
         _refuse(context, ("define",), "a material")
-        view = _View(pixels or (512, 512), spp or 128, depth, camera, envmap, variant)
+        _refuse_unused(context)
+        view = View(pixels or (512, 512), spp or 128, depth, camera, lighting, envmap, variant, mesh, mesh_up)
         if subject.endswith(".safetensors"):
             _refuse(context, ("model", "adapter", "changes"), "an adapter")
             adapter = subject
-        scene, spp = view.load(_material(subject, changes), model, adapter, clamp), view.spp
-    _write(_render(scene, spp, seed, subject), scene, pictures, exposure)
+        scene, spp = view.load(read_material(subject, changes), model, adapter, clamp), view.spp
+    integrator = _clamped(scene, clamp_samples) if clamp_samples is not None else None
+    _write(_render(scene, spp, seed, subject, integrator), scene, pictures, exposure)
 
 
 def compare(
+    context: typer.Context,
     test: Annotated[str, typer.Argument(help="An image (EXR, PNG, ...), or alone: a material.")],
     reference: Annotated[str | None, typer.Argument(help="The image to compare with.")] = None,
     as_json: Annotated[
@@ -133,6 +155,7 @@ def compare(
     clamp: _Clamp = False,
     changes: _Set = None,
     camera: _Camera = "hero",
+    lighting: _Lighting = "studio",
     envmap: _Envmap = None,
     size: _Size = "256",
     spp: Annotated[int, options.samples("Samples per pixel.")] = 256,
@@ -157,8 +180,9 @@ def compare(
     if reference is not None:
         pictures = {"image": read_image(test), "reference": read_image(reference)}
     else:
-        view = _View(_pixels(size), spp, depth, camera, envmap, variant)
-        pictures = _renderings(_material(test, changes), view, seed, adapter, clamp)
+        _refuse_unused(context)
+        view = View(_pixels(size), spp, depth, camera, lighting, envmap, variant)
+        pictures = _renderings(read_material(test, changes), view, seed, adapter, clamp)
     truth = pictures.pop("reference")
     errors = {
         name: image_metrics.compare_images(picture, truth, ldr_exposure=exposure)
@@ -195,7 +219,7 @@ def demo(
     from nma.render import demo as demonstration
 
     settings = demonstration.Settings(_pixels(size), spp, runs, reference_spp, adapter)
-    _use_rgb(variant)
+    use_rgb(variant)
     with _samples_bar("demo", demonstration.total_samples(settings)) as advance:
         lines = demonstration.demo(output, settings, advance)
     for material in dict.fromkeys(line.material for line in lines):
@@ -205,36 +229,8 @@ def demo(
     console.err.print(f"[bold]{output}[/bold] shows the pictures")
 
 
-_MATERIAL_ONLY = ("model", "adapter", "clamp", "changes", "camera", "envmap", "depth")
-
-
-class _View(NamedTuple):
-    """How the preview scene is looked at."""
-
-    size: tuple[int, int]
-    spp: int
-    depth: int
-    camera: str
-    envmap: Path | None
-    variant: str
-
-    def load(self, material: Material, model: str, adapter: str = "", clamp: bool = False) -> Any:
-        """The scene with this material."""
-        from nma.render import load, scene
-
-        _use_rgb(self.variant)
-        bsdf = load.material_bsdf(material, model, adapter=adapter, clamp=clamp)
-        options: dict[str, Any] = {"camera": self.camera, "envmap": self.envmap, "max_depth": self.depth}
-        return load.load_dict(scene.preview_scene(bsdf, size=self.size, spp=self.spp, **options))
-
-
-def _use_rgb(variant: str) -> None:
-    """Chooses the variant for materials, whose parameters are RGB."""
-    import nma.render
-
-    if not variant.endswith("_rgb") and variant != "auto":
-        raise ParamError(f"materials are rendered in RGB, not by {variant}; take llvm_ad_rgb or cuda_ad_rgb")
-    nma.render.use(variant)
+_PREVIEW = ("camera", "lighting", "envmap", "mesh", "mesh_up", "depth")  # of the preview scene
+_MATERIAL_ONLY = ("model", "adapter", "clamp", "changes", *_PREVIEW)
 
 
 def _load_file(
@@ -245,11 +241,11 @@ def _load_file(
     from nma.render.load import load_scene
 
     nma.render.use(variant)
-    scene = load_scene(path, dict(map(_assignment, define or [])), size)
+    scene = load_scene(path, dict(map(assignment, define or [])), size)
     return scene, scene.sensors()[0].sampler().sample_count()
 
 
-def _renderings(material: Material, view: _View, seed: int, adapter: str, clamp: bool) -> dict[str, Any]:
+def _renderings(material: Material, view: View, seed: int, adapter: str, clamp: bool) -> dict[str, Any]:
     """A material by its adapter, by its reference, and by the reference again, each with a seed of its own."""
     by_adapter = view.load(material, "nma", adapter, clamp)
     by_walks = view.load(material, "layered")
@@ -260,11 +256,17 @@ def _renderings(material: Material, view: _View, seed: int, adapter: str, clamp:
     }
 
 
-def _render(scene: Any, spp: int, seed: int, title: str) -> Any:
+def _clamped(scene: Any, limit: float) -> Any:
+    from nma.render.clamp import clamped
+
+    return clamped(scene.integrator(), limit)
+
+
+def _render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) -> Any:
     from nma.render.progressive import render_passes
 
     with _samples_bar(title, spp) as advance:
-        return render_passes(scene, spp, seed=seed, progress=partial(advance, title))
+        return render_passes(scene, spp, seed=seed, integrator=integrator, progress=partial(advance, title))
 
 
 @contextmanager
@@ -306,57 +308,6 @@ def _write_difference(path: Path, title: str, name: str, test: Any, reference: A
     console.err.print(f"{path}: reference, {name}, and FLIP from black (0) to yellow (1)")
 
 
-def _material(name: str, changes: list[str] | None) -> Material:
-    from nma import materials
-    from nma.adapter import Adapter
-    from nma.errors import ParamError
-    from nma.params import MEASURED
-
-    if name.endswith(".safetensors"):
-        # An adapter that knows a single material is one.
-        adapter = Adapter.load(name)
-        if adapter.space.size and adapter.material is None:
-            raise ParamError(
-                f"{name} is an adapter of the whole class {adapter.space.name}; "
-                f"name a material, too: nma render MATERIAL --adapter {name}"
-            )
-        return materials.Material(Path(name).stem, name, "", MEASURED.name, {})
-    material = materials.load(name)
-    return material.changed(dict(map(_change, changes)), "--set") if changes else material
-
-
-def _change(text: str) -> tuple[str, Any]:
-    """`alpha_top=.2` and the like, as in a material file."""
-    name, value = _assignment(text)
-    try:
-        numbers = [float(part) for part in value.split(",")]
-        return name, numbers if len(numbers) > 1 else numbers[0]
-    except ValueError:
-        return name, value if name == "conductor" or value.startswith("#") else _texture(value)
-
-
-def _texture(text: str) -> dict[str, Any]:
-    """`orm.png,channel=g,uv_scale=4` as a material file's table; what is no option belongs to the file's name."""
-    from nma.materials import TEXTURE_OPTIONS
-
-    file, *parts = re.split(rf",(?=(?:{'|'.join(TEXTURE_OPTIONS)})=)", text)
-    return {"texture": file} | {key: _option(value) for key, _, value in (p.partition("=") for p in parts)}
-
-
-def _option(text: str) -> Any:
-    try:
-        return float(text)
-    except ValueError:
-        return {"true": True, "false": False}.get(text, text)
-
-
-def _assignment(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not (equals and name and value):
-        raise typer.BadParameter(f"'{text}' is not of the form NAME=VALUE")
-    return name.strip(), value.strip()
-
-
 def _pixels(text: str) -> tuple[int, int]:
     """Width and height from `512` or `512x384`."""
     from nma.render.progressive import check_size
@@ -379,9 +330,22 @@ def _outputs(path: Path) -> tuple[Path, Path]:
     return path.with_suffix(".exr"), path.with_suffix(".png")
 
 
+def _refuse_unused(context: typer.Context) -> None:
+    """Options of the preview scene that others put out of use."""
+    if context.params["envmap"]:
+        _refuse(context, ("lighting",), "--envmap")
+    if not context.params.get("mesh"):
+        _refuse(context, ("mesh_up",), "the shader ball")
+
+
+def _given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def _refuse(context: typer.Context, names: tuple[str, ...], subject: str) -> None:
     """An option that would do nothing is a mistake."""
-    given = [name for name in names if context.get_parameter_source(name).name == "COMMANDLINE"]  # type: ignore[union-attr]
+    given = [name for name in names if _given(context, name)]
     if given:
-        flags = ", ".join("--set" if name == "changes" else f"--{name}" for name in given)
+        flags = ", ".join("--set" if name == "changes" else f"--{name.replace('_', '-')}" for name in given)
         raise typer.BadParameter(f"{flags} cannot be used with {subject}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,7 @@ def render_passes(
     *,
     seed: int = 0,
     sensor: int = 0,
+    integrator: Any = None,
     progress: Callable[[int], None] = lambda samples: None,
 ) -> NDArray[np.float32]:
     """Render a loaded scene in passes of equal size and average them: (height, width, channels).
@@ -30,6 +32,7 @@ def render_passes(
     Args:
         scene: what `mi.load_dict` or `mi.load_file` returned.
         spp: samples per pixel in total; the last pass may be smaller than the others.
+        integrator: another one than the scene's.
         progress: called after each pass with its samples per pixel.
 
     Raises:
@@ -44,7 +47,8 @@ def render_passes(
     passes = pass_sizes(spp, width * height)
     total = np.zeros(())
     for number, samples in enumerate(passes):
-        image = mi.render(scene, sensor=sensor, spp=samples, seed=_pass_seed(seed, number))  # type: ignore[arg-type]
+        options: Any = {"sensor": sensor, "integrator": integrator, "seed": _pass_seed(seed, number)}
+        image = mi.render(scene, spp=samples, **options)
         total = total + samples * np.array(image, dtype=np.float64)
         progress(samples)
     return (total / spp).astype(np.float32)
@@ -65,6 +69,12 @@ def pass_sizes(spp: int, pixels: int) -> list[int]:
     passes = -(-spp // most)
     each = -(-spp // passes)
     return [each] * (spp // each) + ([spp % each] if spp % each else [])
+
+
+def sampler(spp: int, pixels: int) -> str:
+    """Mitsuba's sampler that leaves the least noise: multi-jittered where all passes fill a grid, as it demands."""
+    filled = all(samples % math.isqrt(samples) == 0 for samples in pass_sizes(spp, pixels))
+    return "multijitter" if filled else "independent"
 
 
 def _pass_seed(seed: int, number: int) -> int:

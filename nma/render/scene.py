@@ -1,11 +1,11 @@
-"""The material-preview scene: the shader ball on graph paper under sun, sky and one small area light.
+"""The material-preview scene: the shader ball, or a mesh, on graph paper under a lighting of `nma.render.lighting`.
 
 Made by code alone, no assets. Everything is a Mitsuba dictionary, so it can be changed before `mi.load_dict`. Names
-that `mi.traverse` shows: `material.*` is the material under test, `floor.*` the paper, `sky.*`, `lamp.*`,
+that `mi.traverse` shows: `material.*` is the material under test, `floor.*` the paper, `sky.*`, outdoors `lamp.*`,
 `sensor.*`. The only shape with the material is `ball`.
 
 Lengths are in units of the shell's radius, z is up. Radiance is scaled so that exposure 0 suits the picture
-(`nma.image_io.tonemap`): perfectly white paper in the sun has radiance 0.77.
+(`nma.image_io.tonemap`): perfectly white paper outdoors has radiance 0.77 in the sun.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError
-from nma.image_io import check_size
-from nma.llvm import ensure_llvm
+from nma.render import lighting as lights
+from nma.render.lighting import smoothstep
+from nma.render.mesh import mesh_shape, needs_coordinates
 from nma.render.shaderball import shader_ball_file
 
 
@@ -39,14 +40,10 @@ CAMERAS: dict[str, Camera] = {
     "top": Camera((0.25, -2.0, 5.6), (0.0, -0.02, 0.9), 26.0),
 }
 
-SUN_DIRECTION = (-0.62, -0.50, 0.72)
-SUN_APERTURE = 4.0  # degrees; eight times the real sun, so that shadows have a soft edge
-SUN_SCALE, SKY_SCALE, TURBIDITY = 1.6, 3.6, 5.0
-SATURATION = 0.5  # of sun and sky; less blue lets the colours of metals read
-GROUND_RADIANCE, HORIZON_BLUR = (0.28, 0.28, 0.28), 0.12
-LAMP_POSITION, LAMP_SIZE, LAMP_RADIANCE = (2.6, -2.4, 3.6), 0.17, (46.0, 42.0, 36.0)
 PAPER_SIZE = 240.0  # side of the floor; the pattern fades out well before
 PAPER_PATTERN = 24.0  # side of the part that carries the pattern
+# How light it is far away, how much more near, and how strong the pattern.
+PAPER_TONE = {"outdoors": (0.60, 0.25, 1.0), "studio": (0.08, 0.45, 0.5)}
 
 
 def preview_scene(
@@ -58,9 +55,13 @@ def preview_scene(
     camera: str | Camera | None = None,
     envmap: str | Path | None = None,
     envmap_scale: float = 1.0,
+    lighting: str = "studio",
+    mesh: str | Path | None = None,
+    mesh_up: str = "z",
     integrator: str | Mapping[str, Any] = "path",
     hide_sun: bool = False,
     rfilter: str = "box",
+    sampler: str = "independent",
 ) -> dict[str, Any]:
     """The preview scene around one material, ready for `mi.load_dict`.
 
@@ -70,18 +71,24 @@ def preview_scene(
         spp: samples per pixel, the default of `mi.render(scene)`.
         max_depth: longest path in edges, as Mitsuba counts (1 is emission alone).
         camera: a name in `CAMERAS`, a `Camera`, or None for "hero".
-        envmap: an EXR or HDR file, latitude-longitude, y up in the file. It replaces the sun, the sky and the lamp.
+        envmap: an EXR or HDR file, latitude-longitude, y up in the file. It replaces all other light.
         envmap_scale: factor on the environment map's radiance.
+        lighting: "studio", softboxes in a dim dome, or "outdoors", sun, sky and a small lamp.
+        mesh: a PLY or OBJ file to show in place of the shader ball, moved and scaled to its size.
+        mesh_up: the axis of that file that points up, "z" or "y".
         integrator: "path", "prb", another integrator of Mitsuba's that takes `max_depth`, or a whole dictionary.
-        hide_sun: leave out the disc of the sun, keep the sky and the lamp.
+        hide_sun: outdoors, leave out the disc of the sun, keep the sky and the lamp.
         rfilter: reconstruction filter of the film. "box" keeps pixels statistically independent.
+        sampler: Mitsuba's. "multijitter" leaves less noise, and takes certain numbers of samples alone:
+            `nma.render.progressive.sampler`.
 
     Returns:
         A new dictionary; nothing in it is shared with other calls.
 
     Raises:
-        ParamError: an unknown camera, a size or spp that is not positive, a missing environment map, no variant of
-            Mitsuba in use.
+        ParamError: an unknown camera or lighting, a size or spp that is not positive, a missing environment map, no
+            variant of Mitsuba in use.
+        MeshError: a mesh that cannot be shown, see `nma.render.mesh.mesh_shape`.
     """
     import mitsuba as mi
 
@@ -90,20 +97,16 @@ def preview_scene(
     width, height = size
     if min(width, height, spp) < 1:
         raise ParamError(f"preview_scene: size {size} and spp {spp} must be at least 1")
+    light = lights.environment(Path(envmap), envmap_scale) if envmap else lights.emitters(lighting, hide_sun)
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": _integrator(integrator, max_depth),
-        "sensor": _sensor(resolve_camera(camera), size, spp, rfilter),
+        "sensor": _sensor(resolve_camera(camera), size, spp, rfilter, sampler),
         "material": {key: value for key, value in bsdf.items() if key != "id"},
-        "ball": {
-            "type": "ply",
-            "filename": str(shader_ball_file()),
-            "bsdf": {"type": "ref", "id": "material"},
-        },
-        "floor": _floor(),
+        "ball": _subject(bsdf, mesh, mesh_up) | {"bsdf": {"type": "ref", "id": "material"}},
+        "floor": _floor(*PAPER_TONE["outdoors" if envmap else lighting]),
     }
-    scene.update(_environment(Path(envmap), envmap_scale) if envmap else _sun_sky_lamp(hide_sun))
-    return scene
+    return scene | light
 
 
 def resolve_camera(camera: str | Camera | None) -> Camera:
@@ -163,11 +166,18 @@ def bitmap_texture(values: NDArray[np.floating], *, scale: float = 1.0) -> dict[
     return texture | {"to_uv": mi.ScalarTransform4f().scale([scale, scale, 1.0])}
 
 
+def _subject(bsdf: Mapping[str, Any], mesh: str | Path | None, up: str) -> dict[str, Any]:
+    """The shape that shows the material."""
+    if mesh is None:
+        return {"type": "ply", "filename": str(shader_ball_file())}
+    return mesh_shape(mesh, up=up, coordinates=needs_coordinates(bsdf))
+
+
 def _integrator(integrator: str | Mapping[str, Any], max_depth: int) -> dict[str, Any]:
     return {"type": integrator, "max_depth": max_depth} if isinstance(integrator, str) else dict(integrator)
 
 
-def _sensor(camera: Camera, size: tuple[int, int], spp: int, rfilter: str) -> dict[str, Any]:
+def _sensor(camera: Camera, size: tuple[int, int], spp: int, rfilter: str, sampler: str) -> dict[str, Any]:
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": rfilter}}
@@ -177,91 +187,15 @@ def _sensor(camera: Camera, size: tuple[int, int], spp: int, rfilter: str) -> di
         "fov_axis": "smaller",
         "to_world": mi.ScalarTransform4f().look_at(list(camera.origin), list(camera.target), list(camera.up)),
         "film": film | {"pixel_format": "rgb", "component_format": "float32"},
-        "sampler": {"type": "independent", "sample_count": spp},
+        "sampler": {"type": sampler, "sample_count": spp},
     }
 
 
-def _sun_sky_lamp(hide_sun: bool) -> dict[str, Any]:
-    """Hosek and Wilkie's sun and sky, and a small square lamp high on the right that shows how sharp a coat is."""
-    import mitsuba as mi
-
-    place = mi.ScalarTransform4f().look_at(list(LAMP_POSITION), [0.0, 0.0, 1.1], [0.0, 0.0, 1.0])
-    lamp = {
-        "type": "rectangle",
-        "to_world": place @ mi.ScalarTransform4f().scale(LAMP_SIZE),
-        "emitter": {
-            "type": "area",
-            "sampling_weight": 0.15,
-            "radiance": {"type": "rgb", "value": list(LAMP_RADIANCE)},
-        },
-    }
-    radiance = mi.Bitmap(sky_radiance(0.0 if hide_sun else SUN_SCALE).copy())
-    return {"sky": {"type": "envmap", "bitmap": radiance, "to_world": _upright()}, "lamp": lamp}
-
-
-@lru_cache(maxsize=4)
-def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.float32]:
-    """Mitsuba's `sunsky` as an image: (height, 2 height, 3) linear sRGB, latitude-longitude, up at the top.
-
-    As an image its sun is importance-sampled: lighting the floor alone, 51 times less variance per sample than the
-    emitter itself. At the horizon the model, black below, goes over softly into the floor's colour; further down
-    the floor hides everything, and black wastes no samples.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    variant = mi.variant()
-    if variant is None:
-        raise ParamError("sky_radiance needs a variant of Mitsuba; call nma.render.use() first")
-    if "scalar" in variant:
-        # The model is evaluated for all pixels at once.
-        ensure_llvm()
-        mi.set_variant("llvm_ad_rgb")
-        try:
-            return sky_radiance(sun_scale, height)
-        finally:
-            mi.set_variant(variant)
-    model = {"type": "sunsky", "sun_direction": list(SUN_DIRECTION), "sun_aperture": SUN_APERTURE}
-    model |= {"sun_scale": sun_scale, "sky_scale": SKY_SCALE, "turbidity": TURBIDITY}
-    azimuth = (np.arange(2 * height) + 0.5) / height * np.pi
-    polar = (np.arange(height) + 0.5) / height * np.pi
-    azimuth, polar = np.meshgrid(azimuth, polar)
-
-    # Look a little above the horizon for all directions below it, then blend to the ground's colour.
-    up = np.maximum(np.cos(polar), 0.01)
-    across = np.sqrt(1.0 - up * up)
-    direction = np.stack([np.sin(azimuth) * across, np.cos(azimuth) * across, up]).reshape(3, -1)
-    si = dr.zeros(mi.SurfaceInteraction3f, direction.shape[1])
-    si.wi = -mi.Vector3f(direction.astype(np.float32))
-    sky = np.array(mi.load_dict(model).eval(si)).T.reshape(height, 2 * height, 3)
-    sky = SATURATION * sky + (1.0 - SATURATION) * (sky @ np.array([0.2126, 0.7152, 0.0722]))[..., None]
-    ground = np.clip(0.5 - np.cos(polar) / (2.0 * HORIZON_BLUR), 0.0, 1.0)[..., None]
-    ground = ground * ground * (3.0 - 2.0 * ground)
-    horizon = sky + (np.array(GROUND_RADIANCE) - sky) * ground
-    radiance = np.where(np.cos(polar)[..., None] < -HORIZON_BLUR, 0.0, horizon).astype(np.float32)
-    radiance.flags.writeable = False  # it is cached
-    return radiance
-
-
-def _environment(path: Path, scale: float) -> dict[str, Any]:
-    if not path.is_file():
-        raise ParamError(f"environment map {path} does not exist; pass an EXR or HDR file")
-    check_size(path)
-    return {"sky": {"type": "envmap", "filename": str(path), "scale": scale, "to_world": _upright()}}
-
-
-def _upright() -> Any:
-    """From Mitsuba's environment maps, y up, to the scene, z up."""
-    import mitsuba as mi
-
-    return mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0)
-
-
-def _floor() -> dict[str, Any]:
+def _floor(far: float, near: float, contrast: float) -> dict[str, Any]:
     """A large sheet of graph paper whose pattern fades out, so that its far edge is one soft grey against the sky."""
     import mitsuba as mi
 
-    pattern = bitmap_texture(_graph_paper(1536))
+    pattern = bitmap_texture(_graph_paper(1536, far, near, contrast))
     repeat = PAPER_SIZE / PAPER_PATTERN
     fit = (
         mi.ScalarTransform4f()
@@ -276,13 +210,8 @@ def _floor() -> dict[str, Any]:
     }
 
 
-def _smoothstep(x: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-    t = np.clip(x / width, 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
-@lru_cache(maxsize=1)
-def _graph_paper(size: int) -> NDArray[np.float32]:
+@lru_cache(maxsize=2)
+def _graph_paper(size: int, far: float, near: float, contrast: float) -> NDArray[np.float32]:
     """Linear reflectance (size, size, 3) of the paper: fine lines, bold lines, alternate squares a little darker."""
     place = (np.arange(size) + 0.5) / size * PAPER_PATTERN - PAPER_PATTERN / 2.0
     x, y = np.meshgrid(place, place)
@@ -294,8 +223,8 @@ def _graph_paper(size: int) -> NDArray[np.float32]:
 
     squares = (np.floor(x) + np.floor(y)) % 2.0
     distance = np.hypot(x, y) / (PAPER_PATTERN / 2.0)
-    fine = 0.22 * (lines(0.25, 0.02) - 0.15) * _smoothstep(0.75 - distance, 0.5)
-    bold = 0.14 * (squares - 0.5) + 0.45 * (lines(1.0, 0.045) - 0.09)
-    tone = 0.60 + 0.25 * _smoothstep(1.0 - distance, 0.9) - fine - bold * _smoothstep(1.0 - distance, 0.8)
+    fine = 0.22 * contrast * (lines(0.25, 0.02) - 0.15) * smoothstep((0.75 - distance) / 0.5)
+    bold = contrast * (0.14 * (squares - 0.5) + 0.45 * (lines(1.0, 0.045) - 0.09))
+    tone = far + near * smoothstep((1.0 - distance) / 0.9) - fine - bold * smoothstep((1.0 - distance) / 0.8)
     paper = np.array([0.49, 0.485, 0.475])
     return (tone[..., None] * paper).astype(np.float32)

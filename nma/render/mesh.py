@@ -1,0 +1,115 @@
+"""A mesh from a file in place of the shader ball."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.adapter import Adapter
+from nma.errors import NmaError, one_line
+
+KINDS = {".ply": "ply", ".obj": "obj"}
+AXES = ("z", "y")
+WIDTH, HEIGHT = 2.0, 2.12  # of the shader ball, which the mesh may fill
+LIFT = 1e-3  # above the floor, so that flat meshes are seen
+ATTRIBUTES = {"positions": 3, "normals": 3, "texcoords": 2}
+
+
+class MeshError(NmaError, ValueError):
+    """A mesh cannot be read, or cannot be shown; the message names the file and the fault."""
+
+
+def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) -> dict[str, Any]:
+    """Mitsuba's dictionary of a mesh that stands on the floor where the shader ball would, as large as that.
+
+    Normals and texture coordinates are those of the file; normals that are missing Mitsuba computes.
+
+    Args:
+        path: a PLY or OBJ file.
+        up: the mesh's axis that points up, "z" or "y".
+        coordinates: whether texture coordinates are needed.
+
+    Raises:
+        MeshError: no such file, not a mesh, one without triangles or extent, numbers that are not finite, missing
+            texture coordinates, or an unknown axis.
+    """
+    import mitsuba as mi
+
+    if up not in AXES:
+        raise MeshError(f"the mesh's axis {up!r} cannot point up; take {' or '.join(AXES)}")
+    description = _description(Path(path))
+    mesh = _load(description, path)
+    if coordinates and not mesh.has_vertex_texcoords():
+        raise MeshError(
+            f"mesh {path} has no texture coordinates (UVs), which this material needs; unwrap it first"
+        )
+    to_world = mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0 if up == "y" else 0.0)
+    points = _points(mesh, path) @ np.array(to_world.matrix)[:3, :3].T
+    return description | {"to_world": _place(points, path) @ to_world}
+
+
+def needs_coordinates(bsdf: Mapping[str, Any]) -> bool:
+    """Whether a BSDF's dictionary has a texture or an anisotropic adapter, which need coordinates on the surface."""
+    import mitsuba as mi
+
+    if bsdf.get("type") == "nma" and "adapter" in bsdf and Adapter.load(bsdf["adapter"]).anisotropic:
+        return True
+    plain = ("rgb", "spectrum", "uniform")
+    values = [value for value in bsdf.values() if isinstance(value, Mapping | mi.Texture)]
+    return any(not isinstance(value, Mapping) or value.get("type") not in plain for value in values)
+
+
+def _description(path: Path) -> dict[str, Any]:
+    kind = KINDS.get(path.suffix.lower())
+    if kind is None:
+        raise MeshError(f"mesh {path} must end in {' or '.join(KINDS)}")
+    if not path.is_file():
+        raise MeshError(f"there is no mesh {path}")
+    return {"type": kind, "filename": str(path)}
+
+
+def _load(description: dict[str, Any], path: str | Path) -> Any:
+    import mitsuba as mi
+
+    try:
+        # Without triangles Mitsuba stumbles over the normals that it computes.
+        if mi.load_dict(description | {"face_normals": True}).face_count() == 0:
+            raise MeshError(f"mesh {path} is empty: it has no triangles")
+        return mi.load_dict(description)
+    except RuntimeError as error:
+        raise MeshError(f"mesh {path} cannot be read: {one_line(str(error))}") from error
+
+
+def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:
+    """The corners of the triangles (n, 3); all that the mesh holds is checked."""
+    import mitsuba as mi
+
+    params = mi.traverse(mesh)
+    for name, size in ATTRIBUTES.items():
+        values = np.array(params[f"vertex_{name}"], dtype=np.float64).reshape(-1, size)
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            raise MeshError(
+                f"mesh {path}: {name} of vertex {np.argmax(bad)} are NaN or infinite; export it anew"
+            )
+    faces = np.array(params["faces"], dtype=np.int64)
+    return np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)[faces]
+
+
+def _place(points: NDArray[np.float64], path: str | Path) -> Any:
+    """Where the bounding box has to go: onto the floor, in the middle."""
+    import mitsuba as mi
+
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = high - low
+    room = np.array([WIDTH, WIDTH, HEIGHT])
+    if extent.max() <= 0.0:
+        raise MeshError(f"mesh {path} has no extent: all of its vertices are one point")
+    scale = float((room / np.maximum(extent, 1e-9 * extent.max())).min())
+    middle = (low + high) / 2.0
+    shift = [-scale * middle[0], -scale * middle[1], LIFT - scale * low[2]]
+    return mi.ScalarTransform4f().translate([float(x) for x in shift]).scale(scale)

@@ -1,0 +1,125 @@
+"""The lightings of the preview scene: what they hold, what noise they leave, and clamping of what remains."""
+
+import numpy as np
+import pytest
+
+import nma.render
+from nma.errors import ParamError
+from nma.render.clamp import clamped
+from nma.render.lighting import LIGHTINGS, SOFTBOXES, sky_directions, sky_radiance, studio_radiance
+from nma.render.load import load_dict
+from nma.render.progressive import pass_sizes, render_passes, sampler
+from nma.render.scene import PAPER_TONE, _graph_paper, preview_scene
+
+nma.render.use("llvm_ad_rgb")
+import mitsuba as mi  # noqa: E402
+
+GREY = {"type": "diffuse"}
+POLISHED = {"type": "roughconductor", "alpha": 0.02}
+
+
+def at(image, direction):
+    """The pixel of a latitude-longitude image that lies closest to a direction."""
+    unit = np.array(direction) / np.linalg.norm(direction)
+    return image.reshape(-1, 3)[np.argmax(sky_directions(len(image)).reshape(-1, 3) @ unit)]
+
+
+def render(lighting, spp, size=48, seed=0, bsdf=POLISHED, **options):
+    return render_passes(
+        load_dict(preview_scene(bsdf, size=(size, size), lighting=lighting, **options)), spp, seed=seed
+    )
+
+
+def test_softboxes_hang_where_they_say():
+    image = studio_radiance()
+    for box in SOFTBOXES:
+        added = at(image, box.towards) - at(image, -np.array(box.towards) * [1, 1, -1])
+        assert added == pytest.approx(box.radiance, abs=0.3)
+
+
+def test_the_studio_has_no_small_bright_light_and_a_dark_horizon():
+    image = studio_radiance().mean(axis=2)
+    assert image.max() < 30.0 < 500.0 < sky_radiance().max()
+    up = sky_directions(len(image))[..., 2]
+    assert np.median(image[(up > 0.0) & (up < 0.05)]) < 0.05 < 0.2 < image[up > 0.9].min()
+
+
+def test_the_studio_leaves_weaker_fireflies_than_outdoors():
+    """What pixels of a polished ball have beyond five times the converged picture, at 16 samples."""
+    beyond = {}
+    for lighting in LIGHTINGS:
+        converged = render(lighting, 256, size=32, seed=1).mean(axis=2)
+        noisy = np.stack([render(lighting, 16, size=32, seed=seed).mean(axis=2) for seed in range(2, 8)])
+        beyond[lighting] = np.maximum(noisy - 5.0 * converged, 0.0).sum()
+    assert beyond["studio"] < 0.2 * beyond["outdoors"]
+
+
+def test_outdoors_stays_what_results_were_measured_in():
+    """The committed results of benches and figures: the picture's mean as they saw it."""
+    image = render("outdoors", 256, size=32, seed=3, bsdf=GREY)
+    assert image.mean(axis=(0, 1)) == pytest.approx([0.2899, 0.2851, 0.2839], rel=0.01)
+
+
+@pytest.mark.parametrize("lighting", LIGHTINGS)
+def test_the_floor_reflects_less_than_it_receives(lighting):
+    reflectance = _graph_paper(512, *PAPER_TONE[lighting])
+    assert 0.0 < reflectance.min() < reflectance.max() < 0.6
+
+
+def test_light_is_refused_where_there_is_no_such():
+    with pytest.raises(ParamError, match="unknown lighting 'indoors'; take studio or outdoors"):
+        preview_scene(GREY, lighting="indoors")
+    with pytest.raises(ParamError, match="no sun to hide"):
+        preview_scene(GREY, hide_sun=True)
+
+
+@pytest.mark.parametrize(("spp", "pixels"), [(128, 512 * 512), (64, 256 * 256), (100, 192 * 192), (7, 64)])
+def test_multijittered_samples_are_taken_where_they_fill_a_grid(spp, pixels, capfd):
+    """Mitsuba rounds other numbers up, and warns."""
+    kind = sampler(spp, pixels)
+    for samples in pass_sizes(spp, pixels):
+        taken = mi.load_dict({"type": kind, "sample_count": samples}).sample_count()
+        assert taken == samples
+    assert capfd.readouterr().out == ""
+
+
+def test_multijittered_samples_leave_less_noise():
+    converged = render("studio", 1024, size=32, seed=1, bsdf=GREY)
+    error = {
+        kind: np.square(render("studio", 64, size=32, seed=2, bsdf=GREY, sampler=kind) - converged).mean()
+        for kind in ("independent", "multijitter")
+    }
+    assert error["multijitter"] < 0.75 * error["independent"]
+
+
+def test_a_clamped_sample_keeps_its_colour():
+    scene = load_dict(
+        {"type": "scene", "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [8, 4, 2]}}}
+    )
+    camera = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}})
+    for limit, expected in ((2.0, [2.0, 1.0, 0.5]), (9.0, [8.0, 4.0, 2.0])):
+        integrator = clamped(mi.load_dict({"type": "path"}), limit)
+        image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=4))
+        assert image[1, 2, :3] == pytest.approx(expected, rel=1e-5)
+
+
+def test_clamping_only_darkens_and_removes_fireflies():
+    scene = load_dict(preview_scene(POLISHED, size=(32, 32), lighting="outdoors"))
+    plain = render_passes(scene, 16, seed=1)
+    dimmed = render_passes(scene, 16, seed=1, integrator=clamped(scene.integrator(), 2.0))
+    assert (dimmed <= plain * (1.0 + 1e-5)).all()
+    assert plain.max() > 3.0 > 2.0 >= dimmed.max()
+    assert 0.5 < (dimmed == plain).mean() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("integrator", "message"),
+    [
+        ({"type": "ptracer"}, "where each is one path"),
+        ({"type": "prb"}, "where each is one path"),
+        ({"type": "aov", "aovs": "n:sh_normal"}, "beside other channels"),
+    ],
+)
+def test_clamping_is_refused_where_it_would_do_something_else(integrator, message):
+    with pytest.raises(ParamError, match=message):
+        clamped(mi.load_dict(integrator), 1.0)
