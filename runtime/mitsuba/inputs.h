@@ -7,7 +7,6 @@
 #include <mitsuba/render/texture.h>
 
 #include <algorithm>
-#include <cmath>
 
 #include "nma/math.h"
 #include "nma/weights.h"
@@ -17,23 +16,39 @@ namespace mitsuba::nma_plugin {
 
 using nma::SourceParam;
 
-// A vector of Mitsuba's for the runtime.
-template <class Vector>
-nma::Vec3<float> direction(const Vector& v) {
-    return {v.x(), v.y(), v.z()};
-}
-
-// Whether there is nothing to see: from behind, or with glossy reflection left out.
-template <class SurfaceInteraction3f>
-bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
-    return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
-}
-
 // One input: a texture, or numbers where there is none.
+template <class Float, class Spectrum>
+struct Input {
+    MI_IMPORT_TYPES(Texture)
+    using Colour = Color<Float, 3>;
+
+    SourceParam param;
+    ref<Texture> texture;
+    // Numbers as they were checked last and moved into the range, and as `mi.traverse` shows them. Of what is lent, `value` is
+    // what it was when it was checked: of edits by those who share it nobody tells.
+    Colour value, shown;
+    // Of a texture, the channel that a parameter of one number takes; -1 if none was chosen.
+    int channel = -1;
+    // Whether the texture shows what it is made of before anything is rendered.
+    bool known = false;
+
+    bool varies() const { return texture && texture->is_spatially_varying(); }
+    // Whether it is the same everywhere, but kept by an object that others may share.
+    bool lent() const { return texture && !varies(); }
+
+    // The numbers of the texture at `si` as they are.
+    Colour looked_up(const SurfaceInteraction3f& si) const {
+        const Colour colour = Colour(texture->eval(si));
+        return param.size == 1 ? Colour(colour[std::max(channel, 0)]) : colour;
+    }
+};
+
 template <class Float, class Spectrum>
 class Inputs {
 public:
     MI_IMPORT_TYPES(Texture)
+    using Input = nma_plugin::Input<Float, Spectrum>;
+    using Colour = typename Input::Colour;
 
     // Ranges are those of the parameters: what the material means, or with `trained` what the adapter was trained on. There the
     // property `clamp` moves what lies beyond instead of refusing it. What a texture only knows while rendering (mesh
@@ -42,29 +57,69 @@ public:
         if (props.has_property("material"))
             Throw("`material` is known in vectorised variants only; give the parameters (`nma materials NAME` shows them, nma.render.load.material_bsdf makes them)");
         for (const SourceParam& p : parameters) {
-            Input input{p, nullptr, {0.0f, 0.0f, 0.0f}};
             if (!props.has_property(p.name)) Throw("no value for %s; give it a number, a colour or a texture", p.name);
-            read(props, input);
-            textured_ |= input.texture != nullptr;
-            inputs_.push_back(input);
+            inputs_.push_back(read(props, p));
+            inputs_.back().channel = channel(props, inputs_.back());
+            settle(inputs_.back());
+            lent_ |= inputs_.back().lent();
         }
     }
 
-    bool textured() const { return textured_; }
+    bool textured() const {
+        return std::any_of(inputs_.begin(), inputs_.end(), [](const Input& input) { return input.varies(); });
+    }
 
     // Those of a one-sided glossy BSDF with these inputs.
     auto flags() const {
         const auto one_sided = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
-        return textured_ ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;
+        return textured() ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;
     }
 
-    // All parameters at `si`, one after the other.
+    // All parameters at `si`, one after the other. After an edit that was refused there are none, until it is mended.
     void at(const SurfaceInteraction3f& si, float* to) const {
+        if (!fault_.empty()) Throw("%s", fault_);
         for (const Input& input : inputs_) {
-            const auto limited = [&](Float x) { return input.texture ? nma::clip(static_cast<float>(x), low(input.param), high(input.param)) : static_cast<float>(x); };
-            const Colour colour = input.texture ? Colour(input.texture->eval(si)) : input.value;
-            for (int c = 0; c < input.param.size; ++c) *to++ = limited(colour[c]);
+            const Colour colour = at(input, si);
+            for (int c = 0; c < input.param.size; ++c) *to++ = static_cast<float>(colour[c]);
         }
+    }
+
+    // Whether inputs that are the same everywhere are what they were when they were checked.
+    bool settled(const SurfaceInteraction3f& si) const {
+        return !lent_ || std::all_of(inputs_.begin(), inputs_.end(), [&](const Input& input) { return !input.lent() || dr::all(at(input, si) == input.value); });
+    }
+
+    void traverse(TraversalCallback* callback) {
+        for (Input& input : inputs_) {
+            if (input.texture) callback->put(input.param.name, input.texture, ParamFlags::NonDifferentiable);
+            else if (input.param.size == 1) callback->put(input.param.name, input.shown.x(), ParamFlags::NonDifferentiable);
+            else callback->put(input.param.name, input.shown, ParamFlags::NonDifferentiable);
+        }
+    }
+
+    // Checks all inputs after an edit.
+    void changed() {
+        try {
+            for (Input& input : inputs_) settle(input);
+            fault_.clear();
+        } catch (const std::exception& e) {
+            fault_ = e.what();
+            throw;
+        }
+    }
+
+    const Input* find(std::string_view name) const {
+        const auto found = std::find_if(inputs_.begin(), inputs_.end(), [&](const Input& input) { return input.param.name == name; });
+        return found == inputs_.end() ? nullptr : &*found;
+    }
+
+    // One or three numbers at `si`, within the range.
+    Colour at(const Input& input, const SurfaceInteraction3f& si) const {
+        if (!input.texture) return input.value;
+        const Colour colour = input.looked_up(si);
+        for (int c = 0; input.known && c < input.param.size; ++c)
+            if (!allowed(input.param, colour[c])) Throw("the texture of %s holds %g, %s", input.param.name, colour[c], range(input.param));
+        return within(input.param, colour);
     }
 
     std::string to_string() const {
@@ -72,65 +127,86 @@ public:
         for (const Input& input : inputs_) {
             text << "  " << input.param.name << " = ";
             if (input.texture) text << string::indent(input.texture) << ",\n";
-            else if (input.param.size == 1) text << input.value.x() << ",\n";
-            else text << input.value << ",\n";
+            else if (input.param.size == 1) text << input.shown.x() << ",\n";
+            else text << input.shown << ",\n";
         }
         return text.str();
     }
 
 private:
-    using Colour = Color<Float, 3>;
+    static Colour within(const SourceParam& p, const Colour& colour) {
+        return {p.clamped(static_cast<float>(colour.x())), p.clamped(static_cast<float>(colour.y())), p.clamped(static_cast<float>(colour.z()))};
+    }
 
-    struct Input {
-        SourceParam param;
-        ref<Texture> texture;
-        Colour value;
-    };
-
-    static float low(const SourceParam& p) { return static_cast<float>(p.low); }
-    static float high(const SourceParam& p) { return static_cast<float>(p.high); }
-
-    void read(const Properties& props, Input& input) {
+    static Input read(const Properties& props, const SourceParam& p) {
         using Type = Properties::Type;
-        const SourceParam& p = input.param;
+        Input input{p, nullptr, Colour(0.0f), Colour(0.0f)};
         const Type type = props.type(p.name);
         if (type == Type::Float || type == Type::Integer) {
-            input.value = Colour(props.get<Float>(p.name));
+            input.shown = Colour(props.get<Float>(p.name));
         } else if (type == Type::Color) {
-            input.value = props.get<Colour>(p.name);
+            input.shown = props.get<Colour>(p.name);
         } else {
             input.texture = props.get_unbounded_texture<Texture>(p.name);
-            if (input.texture->is_spatially_varying()) return check(p, *input.texture);
-            const SurfaceInteraction3f nowhere = dr::zeros<SurfaceInteraction3f>();
-            input.value = Colour(input.texture->eval(nowhere));
+            if (type != Type::Spectrum) return input;
+            input.shown = Colour(input.texture->eval(dr::zeros<SurfaceInteraction3f>()));
             input.texture = nullptr;
         }
-        for (int c = 0; c < p.size; ++c) {
-            Float& x = input.value[c];
-            if (!allowed(p, x)) Throw("%s is %g, %s", p.name, x, range(p));
-            x = nma::clip(static_cast<float>(x), low(p), high(p));
-        }
+        const Colour& c = input.shown;
+        if (p.size == 1 && (c.x() != c.y() || c.x() != c.z())) Throw("%s wants one number or a texture, got the colour %g, %g, %g", p.name, c.x(), c.y(), c.z());
+        return input;
     }
 
-    // Refuses textures that hold what is not allowed, or colours where a single number is wanted.
-    void check(const SourceParam& p, Texture& texture) const {
-        for (const Texels& texels : TexelFinder<Float>(texture).found) {
-            const auto& numbers = texels.numbers;
-            const auto bad = [&](float x) { return !allowed(p, x); };
-            if (const auto first = std::find_if(numbers.begin(), numbers.end(), bad); first != numbers.end()) {
-                const std::size_t pixel = static_cast<std::size_t>(first - numbers.begin()) / texels.channels;
-                Throw("the texture of %s holds %g at x=%zu, y=%zu, one of %zu such values of %zu; %s", p.name, *first, pixel % texels.width, pixel / texels.width,
-                      static_cast<std::size_t>(std::count_if(numbers.begin(), numbers.end(), bad)), numbers.size(), range(p));
+    // The channel that the property NAME_channel chooses, or -1.
+    static int channel(const Properties& props, const Input& input) {
+        const std::string name = input.param.name + "_channel";
+        if (!props.has_property(name)) return -1;
+        const std::string wanted(props.get<std::string_view>(name));
+        if (!input.texture || input.param.size > 1) Throw("%s chooses a channel of a texture for a parameter of one number; leave it out", name);
+        const auto place = std::string_view("rgb").find(wanted);
+        if (wanted.size() != 1 || place == std::string_view::npos) Throw("%s is '%s'; take r, g or b", name, wanted);
+        return static_cast<int>(place);
+    }
+
+    // Refuses what an input may not be; what it may be is its value from now on.
+    void settle(Input& input) const {
+        const SourceParam& p = input.param;
+        if (input.texture) {
+            const std::vector<Texels> found = TexelFinder<Float>(*input.texture).found;
+            input.known = !found.empty();
+            for (const Texels& texels : found) check(input, texels);
+            if (input.lent()) input.value = at(input, dr::zeros<SurfaceInteraction3f>());
+            return;
+        }
+        for (int c = 0; c < p.size; ++c)
+            if (!allowed(p, input.shown[c])) Throw("%s is %g, %s", p.name, input.shown[c], range(p));
+        input.value = within(p, input.shown);
+    }
+
+    // Refuses pixels that are not allowed, or colours where a single number is wanted and no channel was chosen.
+    void check(const Input& input, const Texels& texels) const {
+        const SourceParam& p = input.param;
+        const auto& numbers = texels.numbers;
+        const bool coloured = texels.channels >= 3, one = coloured && input.channel >= 0;
+        for (std::size_t k = 0; p.size == 1 && coloured && !one && k < numbers.size(); ++k)
+            if (nma::absolute(numbers[k] - numbers[k - k % texels.channels]) > 1e-6f)
+                Throw("the texture of %s is coloured, and %s is one number per pixel; choose a channel: set `%s_channel` to r, g or b", p.name, p.name, p.name);
+        std::size_t first = numbers.size(), bad = 0;
+        const std::size_t start = one ? static_cast<std::size_t>(input.channel) : 0, step = one ? texels.channels : 1;
+        for (std::size_t k = start; k < numbers.size(); k += step)
+            if (!allowed(p, numbers[k])) {
+                if (bad++ == 0) first = k;
             }
-            for (std::size_t k = 0; p.size == 1 && k < numbers.size(); ++k)
-                if (nma::absolute(numbers[k] - numbers[k - k % texels.channels]) > 1e-6f)
-                    Throw("the texture of %s is coloured; a grey one is wanted, for one number per pixel", p.name);
-        }
+        if (!bad) return;
+        const std::size_t pixel = first / texels.channels;
+        const std::string place = texels.pixels() > 1 ? tfm::format(" at x=%zu, y=%zu", pixel % texels.width, pixel / texels.width) : "";
+        const char* hint = texels.bytes ? "; its pixels are bytes, 0 to 1; with `format` \"variant\" a bitmap keeps floats, which can be edited" : "";
+        Throw("the texture of %s holds %g%s, one of %zu such values of %zu; %s%s", p.name, numbers[first], place, bad, numbers.size() / step, range(p), hint);
     }
 
-    bool allowed(const SourceParam& p, float x) const {
-        const float slack = 1e-6f * nma::maximum(nma::absolute(low(p)), 1.0f);
-        return std::isfinite(x) && (clamp_ || (x >= low(p) - slack && x <= high(p) + slack));
+    bool allowed(const SourceParam& p, Float x) const {
+        const float number = static_cast<float>(x);
+        return nma::is_finite(number) && (clamp_ || p.allows(number));
     }
 
     std::string range(const SourceParam& p) const {
@@ -139,15 +215,8 @@ private:
     }
 
     std::vector<Input> inputs_;
-    bool trained_, clamp_, textured_ = false;
+    bool trained_, clamp_, lent_ = false;
+    std::string fault_;
 };
-
-// Registers a plugin for `scalar_rgb` alone: other variants have the Python BSDF of the same name.
-#define NMA_EXPORT_SCALAR_PLUGIN(Name)                                                                         \
-    template class Name<float, Color<float, 3>>;                                                               \
-    extern "C" MI_EXPORT void init_plugin(std::string_view name, PluginRegisterFn add) {                       \
-        using Plugin = Name<float, Color<float, 3>>;                                                           \
-        add(name, "scalar_rgb", Plugin::Type, [](void*, const Properties& p) -> ref<Object> { return new Plugin(p); }); \
-    }
 
 }  // namespace mitsuba::nma_plugin

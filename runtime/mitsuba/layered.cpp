@@ -1,30 +1,26 @@
 // Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, the reference for its adapter. Built
 // by `nma mitsuba build`.
 //
-// `sample` is one walk, `eval` one unbiased estimate. Mitsuba gives `eval` no random numbers; it makes its own from the bits
-// of its arguments. Properties: the parameters of the class `layered3`.
+// `eval` is one unbiased estimate. Mitsuba gives it no random numbers; it makes its own from the bits of its arguments.
+// `sample` is one walk where the shape has this very BSDF. Within others, such as `blendbsdf` and `mask`, which recombine
+// samples by their densities, it draws from the density itself, as no walk does, and its weight is an estimate over that.
+// Properties: the parameters of the class `layered3`.
 #include <mitsuba/core/random.h>
+#include <mitsuba/render/shape.h>
 
-#include "inputs.h"
 #include "nma/classes.h"
 #include "nma/layered.h"
+#include "source_bsdf.h"
 
 namespace mitsuba::nma_plugin {
 
 template <typename Float, typename Spectrum>
-class LayeredBSDF final : public BSDF<Float, Spectrum> {
+class LayeredBSDF final : public SourceBSDF<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(BSDF, m_flags, m_components)
-    MI_IMPORT_TYPES()
+    MI_IMPORT_BASE(SourceBSDF, inputs_, hidden)
+    MI_IMPORT_TYPES(Shape)
 
-    explicit LayeredBSDF(const Properties& props) : Base(props), inputs_(props, nma::layered3_parameters(), false) {
-        m_flags = inputs_.flags();
-        m_components.push_back(m_flags);
-    }
-
-    Spectrum eval(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
-        return eval_pdf(context, si, wo, active).first;
-    }
+    explicit LayeredBSDF(const Properties& props) : Base(props, nma::layered3_parameters(), false) {}
 
     Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
         if (hidden(context, si)) return 0.0f;
@@ -65,6 +61,8 @@ private:
         return nma::layered::Layers::of(numbers);
     }
 
+    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return nma::layered::albedo(at(si), direction(si.wi)); }
+
     // A stream of random numbers that depends on the bits of `numbers`.
     template <std::size_t N>
     static nma::layered::Random random(const float (&numbers)[N]) {
@@ -85,21 +83,34 @@ private:
         return {Spectrum(value.x, value.y, value.z), nma::layered::pdf(layers, density, direction(si.wi), direction(wo))};
     }
 
-    static std::pair<BSDFSample3f, Spectrum> sampled(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2) {
+    std::pair<BSDFSample3f, Spectrum> sampled(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
+        BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
+        drawn.eta = 1.0f;
+        drawn.sampled_type = +BSDFFlags::GlossyReflection;
+        const bool alone = si.shape && si.shape->bsdf() == this;
+        const Spectrum weight = alone ? walked(layers, density, si, u, u2, drawn) : followed(layers, density, si, u, u2, drawn);
+        if (!(drawn.pdf > 0.0f)) return {dr::zeros<BSDFSample3f>(), 0.0f};
+        return {drawn, weight};
+    }
+
+    // Where a walk leaves, and its throughput. The density is near its own.
+    static Spectrum walked(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
         nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
         const nma::layered::Walk walk = nma::layered::walk(layers, direction(si.wi), rng);
         const nma::Vec3<float>& t = walk.throughput;
-        BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
-        if (!(t.x > 0.0f || t.y > 0.0f || t.z > 0.0f)) return {drawn, 0.0f};
         drawn.wo = Vector3f(walk.direction.x, walk.direction.y, walk.direction.z);
-        drawn.pdf = nma::layered::pdf(layers, density, direction(si.wi), walk.direction);
-        drawn.eta = 1.0f;
-        drawn.sampled_type = +BSDFFlags::GlossyReflection;
-        if (!(drawn.pdf > 0.0f)) return {dr::zeros<BSDFSample3f>(), 0.0f};
-        return {drawn, Spectrum(t.x, t.y, t.z)};
+        if (t.x > 0.0f || t.y > 0.0f || t.z > 0.0f) drawn.pdf = nma::layered::pdf(layers, density, direction(si.wi), walk.direction);
+        return Spectrum(t.x, t.y, t.z);
     }
 
-    Inputs<Float, Spectrum> inputs_;
+    // A direction that follows the density, and the estimate of `eval` over it.
+    static Spectrum followed(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
+        const nma::layered::Drawn found = nma::layered::sample(layers, density, direction(si.wi), u, u2.x(), u2.y());
+        drawn.wo = Vector3f(found.wo.x, found.wo.y, found.wo.z);
+        const auto [value, pdf] = evaluated(layers, density, si, drawn.wo);
+        drawn.pdf = pdf;
+        return value / pdf;
+    }
 };
 
 NMA_EXPORT_SCALAR_PLUGIN(LayeredBSDF)

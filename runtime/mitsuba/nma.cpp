@@ -7,33 +7,25 @@
 // products of such).
 #include <mitsuba/core/fresolver.h>
 
-#include "inputs.h"
 #include "nma.h"
+#include "source_bsdf.h"
 
 namespace mitsuba::nma_plugin {
 
 template <typename Float, typename Spectrum>
-class NmaBSDF final : public BSDF<Float, Spectrum> {
+class NmaBSDF final : public SourceBSDF<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(BSDF, m_flags, m_components)
+    MI_IMPORT_BASE(SourceBSDF, m_flags, m_components, inputs_, hidden)
     MI_IMPORT_TYPES()
 
-    explicit NmaBSDF(const Properties& props)
-        : Base(props), name_(props.get<std::string_view>("adapter", "layered3-5x64")), adapter_(load(name_, props.get<std::string_view>("precision", "float32"))),
-          inputs_(props, adapter_.parameters(), true) {
-        const bool online = props.get<bool>("online", false);
-        m_flags = inputs_.flags();
-        if (adapter_.anisotropic()) m_flags = m_flags | BSDFFlags::Anisotropic;
-        m_components.push_back(m_flags);
-        if (inputs_.textured() || online || adapter_.anisotropic()) return;
-        float parameters[MOST_PARAMETERS];
-        inputs_.at(dr::zeros<SurfaceInteraction3f>(), parameters);
-        curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
+    explicit NmaBSDF(const Properties& props) : NmaBSDF(props, load(adapter_name(props), props.get<std::string_view>("precision", "float32"))) {}
+
+    void parameters_changed(const std::vector<std::string>& keys) override {
+        curves_.reset();
+        Base::parameters_changed(keys);
+        tabulate();
     }
 
-    Spectrum eval(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
-        return eval_pdf(context, si, wo, active).first;
-    }
     Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
         return eval_pdf(context, si, wo, active).second;
     }
@@ -64,6 +56,22 @@ public:
 private:
     static constexpr int MOST_PARAMETERS = 64;
 
+    NmaBSDF(const Properties& props, nma::Adapter adapter)
+        : Base(props, adapter.parameters(), true), name_(adapter_name(props)), adapter_(std::move(adapter)), online_(props.get<bool>("online", false)) {
+        if (adapter_.anisotropic()) m_flags = m_components[0] = m_flags | BSDFFlags::Anisotropic;
+        tabulate();
+    }
+
+    static std::string adapter_name(const Properties& props) { return std::string(props.get<std::string_view>("adapter", "layered3-5x64")); }
+
+    // Curves of the present inputs, where a material has such.
+    void tabulate() {
+        if (inputs_.textured() || online_ || adapter_.anisotropic()) return;
+        float parameters[MOST_PARAMETERS];
+        inputs_.at(dr::zeros<SurfaceInteraction3f>(), parameters);
+        curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
+    }
+
     // Weights lie beside the scene, as the files of Mitsuba's own plugins do; shipped ones beside the plugins.
     static nma::Adapter load(const std::string& name, std::string_view precision) {
         const auto resolver = file_resolver();
@@ -85,11 +93,13 @@ private:
 
     nma::Material prepare(const SurfaceInteraction3f& si) const {
         const float cosine = nma::clip(static_cast<float>(si.wi.z()), 1e-4f, 1.0f);
-        if (curves_) return curves_->at(cosine);
+        if (curves_ && inputs_.settled(si)) return curves_->at(cosine);
         float parameters[MOST_PARAMETERS];
         inputs_.at(si, parameters);
         return adapter_.prepare(parameters, nma::Direction{static_cast<float>(si.wi.x()), static_cast<float>(si.wi.y()), cosine});
     }
+
+    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return prepare(si).albedo(direction(si.wi)); }
 
     static std::pair<Spectrum, Float> evaluated(const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) {
         const nma::Value v = material.eval(direction(si.wi), direction(wo));
@@ -109,7 +119,7 @@ private:
 
     std::string name_;
     nma::Adapter adapter_;
-    Inputs<Float, Spectrum> inputs_;
+    bool online_;
     std::unique_ptr<nma::Curves> curves_;
 };
 

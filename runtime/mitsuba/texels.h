@@ -15,6 +15,10 @@ namespace mitsuba::nma_plugin {
 struct Texels {
     std::vector<float> numbers;
     std::size_t width = 1, channels = 1;
+    // Whether Mitsuba keeps bytes.
+    bool bytes = false;
+
+    std::size_t pixels() const { return numbers.size() / channels; }
 };
 
 // Finds all arrays, numbers and colours that a texture and those inside it show as `data` and `value`.
@@ -51,12 +55,12 @@ private:
         using Tensor = dr::Tensor<dr::DynamicArray<T>>;
         if (type != typeid(Tensor)) return false;
         const auto& tensor = *static_cast<Tensor*>(value);
-        Texels texels{{}, tensor.ndim() > 1 ? tensor.shape(1) : 1, tensor.ndim() > 2 ? tensor.shape(2) : 1};
+        Texels texels{{}, tensor.ndim() > 1 ? tensor.shape(1) : 1, tensor.ndim() > 2 ? tensor.shape(2) : 1, std::is_same_v<T, uint8_t>};
         // Mitsuba decodes bytes when it looks them up, from sRGB unless the texture is `raw`.
-        const bool srgb = std::is_same_v<T, uint8_t> && shown_->to_string().find("raw = 1") == std::string::npos;
+        const bool srgb = texels.bytes && shown_->to_string().find("raw = 1") == std::string::npos;
         for (std::size_t k = 0; k < tensor.size(); ++k) {
             float x = static_cast<float>(tensor.array().entry(k));
-            if (std::is_same_v<T, uint8_t>) x /= 255.0f;
+            if (texels.bytes) x /= 255.0f;
             texels.numbers.push_back(srgb ? dr::srgb_to_linear(x) : x);
         }
         found.push_back(std::move(texels));

@@ -1,0 +1,76 @@
+"""Programs in Mitsuba's scalar renderer, whose plugins are compiled: processes that several test files start."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from nma import native
+
+MATERIAL = {
+    "alpha_top": 0.08,
+    "alpha_bottom": 0.25,
+    "eta_top": 1.5,
+    "eta_conductor": {"type": "rgb", "value": [0.14, 0.37, 1.44]},
+    "k_conductor": {"type": "rgb", "value": [3.98, 2.38, 1.6]},
+    "albedo": {"type": "rgb", "value": [0.9, 0.3, 0.2]},
+    "sigma_t": 0.5,
+}
+# What every program begins with: its variant and its arguments.
+PRELUDE = """
+import json, sys
+import mitsuba as mi
+import numpy as np
+import nma.render
+
+variant, *words = json.loads(sys.argv[1])
+nma.render.use(variant)
+
+
+def refusal(call):
+    try:
+        call()
+    except Exception as error:
+        return str(error)
+    raise AssertionError("nothing was refused")
+
+
+def interaction(cosine, azimuth=0.0):
+    si = mi.SurfaceInteraction3f()
+    sine = np.sqrt(1 - cosine**2)
+    si.wi = [float(sine * np.cos(azimuth)), float(sine * np.sin(azimuth)), cosine]
+    return si
+"""
+
+
+@contextmanager
+def own_cache(tmp_path_factory) -> Iterator[Path]:
+    """The folder of plugins that were built once for all of this run's processes, not into the user's cache."""
+    if shutil.which("c++") is None:
+        pytest.skip("there is no C++ compiler here")
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(shared / "scalar-cache"))
+        yield native.build_mitsuba()
+
+
+def run(program: str, variant: str, *words) -> subprocess.CompletedProcess:
+    """A program after `PRELUDE`, whose `words` it finds as such."""
+    text = PRELUDE + textwrap.dedent(program)
+    command = [sys.executable, "-c", text, json.dumps([variant, *words])]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def finished(program: str, variant: str, *words) -> list[str]:
+    """The lines that it prints; whatever is wrong with it fails the test."""
+    done = run(program, variant, *words)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout.splitlines()
