@@ -2,50 +2,44 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
-from rich.console import Console
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, Group, RenderableType
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
+from nma.progress import TrainingBar, err, progress
+
+__all__ = ["TrainingBar", "err", "loss_plot", "number", "out", "progress", "table"]
+
 out = Console()
-err = Console(stderr=True)
+
+_GAP = 2
+# Longer cells are sentences, which may be broken between words.
+_SENTENCE = 24
 
 
-def progress(unit: str) -> Progress:
-    """A progress bar with a rate in `unit` (the field `rate`), a note (the field `note`) and the time left."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]} " + unit),
-        TextColumn("{task.fields[note]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=err,
-    )
+def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None) -> Group:
+    """A table that fits the terminal: sentences are broken between words, numbers never are.
+
+    Columns that do not fit go into a second table below the first, and so on, with the first column repeated. Brackets
+    are no markup in it.
+    """
+    cells = [[number(cell) if isinstance(cell, float) else str(cell) for cell in row] for row in rows]
+    columns = [
+        _Column(heading, [row[n] for row in cells], first=n == 0) for n, heading in enumerate(headings)
+    ]
+    parts: list[RenderableType] = [f"[bold]{escape(title)}[/bold]"] if title else []
+    return Group(*parts, *(_table([columns[0], *part]) for part in _parts(columns)))
 
 
-def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None) -> Table:
-    """A table whose first column is text and whose others are aligned to the right; brackets are no markup in it."""
-    result = Table(title=escape(title) if title else None)
-    for n, heading in enumerate(headings):
-        result.add_column(heading, justify="left" if n == 0 else "right", overflow="fold")
-    for row in rows:
-        result.add_row(*(f"{cell:.4g}" if isinstance(cell, float) else escape(str(cell)) for cell in row))
-    return result
+def number(value: float) -> str:
+    """Four digits, as short as can be: .01382 and 6.5e-06."""
+    text = f"{value:.4g}" if abs(value) >= 1e-4 or value == 0 else f"{value:.1e}"
+    return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text
 
 
 def loss_plot(output: Path) -> Path:
@@ -53,28 +47,42 @@ def loss_plot(output: Path) -> Path:
     return output.with_suffix(".loss.png")
 
 
-class TrainingBar:
-    """A progress bar that shows the loss over the last steps and bins per second."""
+class _Column:
+    """A column; `width` is what it needs at least."""
 
-    def __init__(self, recipe: Any, title: str = "training"):
-        self._bar, self._recipe, self._title = progress("Mbins/s"), recipe, title
-        self._began, self._first = time.perf_counter(), None
+    def __init__(self, heading: str, cells: Sequence[str], first: bool):
+        widest = max(map(cell_len, cells), default=0)
+        self.sentences = widest > _SENTENCE
+        if cell_len(heading) > widest:
+            heading = heading.replace("_", "\n")
+        self.heading, self.cells, self.first = heading, cells, first
+        words = [word for text in (*cells, heading) for word in text.split()] if self.sentences else []
+        lines = [*cells, *heading.split("\n")]
+        self.width = max(_SENTENCE, *map(cell_len, words)) if words else max(map(cell_len, lines))
 
-    def __enter__(self) -> TrainingBar:
-        self._bar.__enter__()
-        self._task = self._bar.add_task(self._title, total=self._recipe.steps, rate="", note="")
-        return self
 
-    def __exit__(self, *args: Any) -> None:
-        self._bar.__exit__(*args)
+def _parts(columns: Sequence[_Column]) -> list[list[_Column]]:
+    """The columns behind the first, in as few tables as hold them."""
+    parts: list[list[_Column]] = [[]]
+    room = out.width - columns[0].width
+    for column in columns[1:]:
+        if parts[-1] and sum(c.width + _GAP for c in (*parts[-1], column)) > room:
+            parts.append([])
+        parts[-1].append(column)
+    return parts
 
-    def update(self, run: Any) -> None:
-        if self._first is None:
-            self._first, self._began = run.step, time.perf_counter()
-            return
-        rate = (
-            (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
+
+def _table(columns: Sequence[_Column]) -> Table:
+    result = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, _GAP - 1, 0, 0), pad_edge=False)
+    for column in columns:
+        left = column.first or column.sentences
+        result.add_column(
+            escape(column.heading),
+            justify="left" if left else "right",
+            no_wrap=not column.sentences,
+            min_width=min(column.width, out.width),
+            overflow="fold",
         )
-        recent = run.log_losses[-500:]
-        note = f"log loss {sum(recent) / len(recent):.5f}"
-        self._bar.update(self._task, completed=run.step, rate=f"{rate:.2f}", note=note)
+    for row in zip(*(column.cells for column in columns), strict=True):
+        result.add_row(*map(escape, row))
+    return result

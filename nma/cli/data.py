@@ -136,14 +136,27 @@ def dataset(
     before = materials - len(data.missing())
     with console.progress("Mwalks/s") as bar:
         task = bar.add_task("simulating", total=materials, completed=before, rate="", note="")
-        began = time.perf_counter()
+        began, told = time.perf_counter(), False
 
         def progress(done: int) -> None:
+            nonlocal told
             rate = (done - before) * walks / (time.perf_counter() - began) / 1e6
             bar.update(task, completed=done, rate=f"{rate:.1f}")
+            if rate and not told:
+                left = (materials - done) * walks / (1e6 * rate)
+                console.err.print(f"{_span(left)} to go at {rate:.1f} million walks per second")
+                told = True
 
         data.write(progress)
     console.err.print(f"{output}: complete, {materials} materials")
+
+
+def _span(seconds: float) -> str:
+    """So long, in the unit that suits it."""
+    for unit, size in (("days", 86_400), ("hours", 3600), ("minutes", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} seconds"
 
 
 def _vectors(space, params, material, draw, population, seed):

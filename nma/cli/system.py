@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from nma.cli import console
+
+_ABOUT_THE_LOSS = (
+    "The log loss of training is against tables as noisy as their walks leave them, so that it holds their noise too. "
+    "`nma evaluate` says how far an adapter is from a reference, and how much noise the reference has."
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -50,9 +55,12 @@ def info(
         return
     for name, value in facts.items():
         if isinstance(value, dict):
-            console.out.print(console.table((name, ""), [(k, str(v)) for k, v in value.items()]))
+            console.out.print("", console.table((name, ""), [(k, _plain(v)) for k, v in value.items()]))
         else:
-            console.out.print(f"[bold]{name}[/bold]: {value}")
+            console.out.print(f"[bold]{name}[/bold]: {_plain(value)}", highlight=False)
+    if "log_loss_of_last_1000_steps" in adapter.training:
+        console.out.print()
+        console.out.print(_ABOUT_THE_LOSS, highlight=False)
 
 
 def doctor() -> None:
@@ -60,10 +68,24 @@ def doctor() -> None:
     from nma.doctor import check
 
     findings = check()
-    rows = [
-        (f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found, "" if f.ok else f.fix)
-        for f in findings
-    ]
-    console.out.print(console.table(("what", "state", "found", "to mend it"), rows))
+    rows = [(f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found) for f in findings]
+    console.out.print(console.table(("what", "state", "found"), rows))
+    # Commands stand alone, unbroken, to be copied.
+    for f in findings:
+        if not f.ok:
+            console.out.print(f"\n{f.name}:\n  {f.fix}", markup=False, highlight=False, soft_wrap=True)
     if not all(f.ok or f.optional for f in findings):
         raise typer.Exit(1)
+
+
+def _plain(value: Any) -> str:
+    """A fact for people: numbers of four digits, without the brackets of Python."""
+    if isinstance(value, float):
+        return console.number(value)
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_plain(v)}" for name, v in value.items())
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        return ", ".join(" x ".join(map(str, shape)) for shape in value)
+    if isinstance(value, list):
+        return ", ".join(map(_plain, value))
+    return str(value)

@@ -8,6 +8,7 @@ from typing import Any
 from nma.adapter import Adapter
 from nma.errors import NmaError, TableError
 from nma.params import MEASURED
+from nma.progress import of_training
 from nma.sources.base import Values
 from nma.table import Tables
 from nma.train import loop
@@ -37,19 +38,27 @@ def fit(
     recipe: Recipe | None = None,
     record: dict[str, Any] | None = None,
     *,
-    progress: Progress = lambda run: None,
+    progress: Progress | None = None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Adapter, loop.Run]:
     """An adapter of class "measured", which has no parameters, for one material.
 
     Sources that know their values are compared with the target point by point, tables bin by bin, isotropic or not.
     `recipe_for(source)` is the recipe unless another is given; `record` says where the source comes from and is stored
-    with the weights. Raises `NmaError` where the recipe is for isotropic materials and the source is not, or the other
-    way round, and `TableError` for tables of several materials.
+    with the weights. `progress` is called as training goes on; without one, a bar goes along on stderr if that is a
+    terminal, and `lambda run: None` keeps it quiet. Raises `NmaError` where the recipe is for isotropic materials and
+    the source is not, or the other way round, and `TableError` for tables of several materials.
     """
     recipe = recipe or recipe_for(source)
-    if isinstance(source, Tables):
-        return _fit_table(source, recipe, record or {}, progress, budget_seconds)
+    with of_training(progress, recipe, "fitting") as show:
+        if isinstance(source, Tables):
+            return _fit_table(source, recipe, record or {}, show, budget_seconds)
+        return _fit_values(source, recipe, record or {}, show, budget_seconds)
+
+
+def _fit_values(
+    source: Values, recipe: Recipe, record: dict[str, Any], progress: Progress, budget_seconds: float
+) -> tuple[Adapter, loop.Run]:
     _check_isotropy(source.name, source.isotropic, recipe)
     if recipe.loss != "log":
         raise NmaError(
@@ -65,7 +74,7 @@ def fit(
         progress=progress,
         budget_seconds=budget_seconds,
     )
-    return adapter_of(MEASURED, recipe, run, {"material": source.name, **(record or {})}), run
+    return adapter_of(MEASURED, recipe, run, {"material": source.name, **record}), run
 
 
 def _fit_table(

@@ -17,6 +17,7 @@ from nma.errors import TableError
 from nma.evaluate import table_log_loss
 from nma.library import Library
 from nma.params import CODE_BOUND, LIBRARY
+from nma.progress import of_training
 from nma.table import ISOTROPIC, Tables
 from nma.train import loop
 from nma.train.data import Batch, BinSampler, Pool, draw
@@ -106,11 +107,12 @@ def encode(
     tables: Tables,
     *,
     recipe: Recipe = ENCODING,
-    progress: Callable[[loop.Run], None] = lambda run: None,
+    progress: Callable[[loop.Run], None] | None = None,
 ) -> Encoded:
     """Learns the code of the one material of `tables`, the network as it is.
 
-    The search starts at the mean code and at those of the nearest materials, all at once, and keeps the best.
+    The search starts at the mean code and at those of the nearest materials, all at once, and keeps the best. Without
+    `progress`, a bar goes along on stderr if that is a terminal.
     """
     if tables.values.shape != (1, *ISOTROPIC.shape):
         raise TableError(f"one table {ISOTROPIC.shape} is encoded at a time, got {tables.values.shape}")
@@ -123,9 +125,9 @@ def encode(
     starts = np.concatenate([library.codes.mean(axis=0, keepdims=True), library.codes[near]])
     weights = free_of(starts).astype(np.float32), adapter.layers
     run = loop.start(recipe, weights)
-    loop.train(
-        recipe, run, _source(_repeated(tables, len(starts)), recipe), objective=_held, progress=progress
-    )
+    with of_training(progress, recipe, "encoding") as show:
+        batches = _source(_repeated(tables, len(starts)), recipe)
+        loop.train(recipe, run, batches, objective=_held, progress=show)
     found = np.asarray(code_of(loop.result(run, recipe)[0]))
     # The nearest code may already be the best.
     found = np.concatenate([found, library.codes[near[:1]]])

@@ -1,0 +1,77 @@
+"""Progress bars on stderr, of commands and of whatever takes minutes in Python."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+err = Console(stderr=True)
+
+
+def progress(unit: str) -> Progress:
+    """A progress bar with a rate in `unit` (the field `rate`), a note (the field `note`) and the time left."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]} " + unit),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=err,
+    )
+
+
+class TrainingBar:
+    """A progress bar that shows the loss over the last steps and bins per second."""
+
+    def __init__(self, recipe: Any, title: str = "training"):
+        self._bar, self._recipe, self._title = progress("Mbins/s"), recipe, title
+        self._began, self._first = time.perf_counter(), None
+
+    def __enter__(self) -> TrainingBar:
+        self._bar.__enter__()
+        self._task = self._bar.add_task(self._title, total=self._recipe.steps, rate="", note="")
+        return self
+
+    def __exit__(self, *args: Any) -> None:
+        self._bar.__exit__(*args)
+
+    def update(self, run: Any) -> None:
+        if self._first is None:
+            self._first, self._began = run.step, time.perf_counter()
+            return
+        rate = (
+            (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6
+        )
+        recent = run.log_losses[-500:]
+        note = f"log loss {sum(recent) / len(recent):.5f}"
+        self._bar.update(self._task, completed=run.step, rate=f"{rate:.2f}", note=note)
+
+
+@contextmanager
+def of_training(
+    given: Callable[[Any], None] | None, recipe: Any, title: str = "training"
+) -> Iterator[Callable[[Any], None]]:
+    """What to call as training goes on: what was given, else a bar where stderr is a terminal, else nothing."""
+    if given is not None:
+        yield given
+    elif not sys.stderr.isatty():
+        yield lambda run: None
+    else:
+        with TrainingBar(recipe, title) as bar:
+            yield bar.update

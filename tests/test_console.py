@@ -1,0 +1,121 @@
+"""What commands print can be read, however narrow the terminal."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from nma import progress
+from nma.cli import console, data
+from nma.metrics import FIGURES
+from nma.train import fit
+from nma.train.recipe import SINGLE
+
+
+def printed(monkeypatch, width, *table):
+    """The lines of a table on a terminal of that width."""
+    monkeypatch.setattr(console, "out", Console(width=width, file=io.StringIO()))
+    console.out.print(console.table(*table))
+    return [line.rstrip() for line in console.out.file.getvalue().splitlines()]
+
+
+def _figures():
+    rng = np.random.default_rng(0)
+    return [(f"{n}", *map(float, 10 ** rng.uniform(-5, 2, len(FIGURES)))) for n in range(3)]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 132])
+def test_numbers_are_never_broken(monkeypatch, width):
+    rows = _figures()
+    lines = printed(monkeypatch, width, ("material", *FIGURES), rows, "tiny.safetensors against [x].npz")
+    assert max(map(len, lines)) <= width
+    words = " ".join(lines).split()
+    for _, *figures in rows:
+        for figure in figures:
+            assert console.number(figure) in words
+
+
+def test_the_figures_of_an_evaluation_fit_80_columns(monkeypatch):
+    """For figures as they are: of some thousandths, a few of them smaller, and a PSNR."""
+    row = ("mean", 0.002731, 0.004236, 0.09136, 0.07076, 0.001586, 64.42, 0.00521, 0.001035)
+    lines = printed(monkeypatch, 80, ("material", *FIGURES), [row])
+    assert len(row) == 1 + len(FIGURES)
+    assert lines[-1].split() == [
+        "mean",
+        ".002731",
+        ".004236",
+        ".09136",
+        ".07076",
+        ".001586",
+        "64.42",
+        ".00521",
+        ".001035",
+    ]
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_sentences_are_broken_between_words(monkeypatch, width):
+    sentence = "Burnished gold under a glossy red lacquer, orange in the highlights"
+    lines = printed(monkeypatch, width, ("name", "", "number"), [("gold", sentence, 1.25)])
+    assert max(map(len, lines)) <= width
+    assert set(sentence.split()) <= set(" ".join(lines).split())
+    assert "1.25" in " ".join(lines)
+
+
+def test_numbers_have_four_digits_or_two_where_they_are_tiny():
+    shown = [console.number(x) for x in (0.0138249, -0.5, 0.0, 1.0, 64.4213, 1.5e-6, np.inf)]
+    assert shown == [".01382", "-.5", "0", "1", "64.42", "1.5e-06", "inf"]
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_what_commands_print_fits_the_terminal(nma, monkeypatch, width):
+    monkeypatch.setattr(console, "out", Console(width=width))
+    for words in (("materials",), ("materials", "gold-red-lacquer"), ("info",), ("info", "layered3-3x32")):
+        code, out, err = nma(*words)
+        assert code == 0, err
+        assert max(map(len, out.splitlines())) <= width, words
+
+
+def test_the_loss_of_training_is_told_from_the_error_of_the_adapter(nma):
+    _, out, _ = nma("info", "layered3-5x64")
+    assert "log_loss_of_last_1000_steps  .01036" in out
+    assert "holds their noise too" in " ".join(out.split())
+
+
+def test_a_fit_shows_a_bar_on_terminals_alone_and_none_if_told(monkeypatch):
+    class Bar:
+        made = 0
+
+        def __init__(self, recipe, title):
+            Bar.made += 1
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *args):
+            pass
+
+        def update(self, run):
+            pass
+
+    monkeypatch.setattr(progress, "TrainingBar", Bar)
+    monkeypatch.setattr(fit, "_fit_values", lambda source, recipe, record, show, budget: show(None))
+    for terminal, given, bars in ((True, None, 1), (True, lambda run: None, 0), (False, None, 0)):
+        Bar.made = 0
+        monkeypatch.setattr(sys.stderr, "isatty", lambda terminal=terminal: terminal)
+        fit.fit(object(), SINGLE, progress=given)
+        assert Bar.made == bars
+
+
+def test_a_dataset_says_how_long_it_will_take(nma, tmp_path):
+    code, _, err = nma("dataset", "layered3", tmp_path / "x.zarr", "--materials", 2, "--walks", 1600)
+    assert code == 0
+    assert "to go at" in err and "million walks per second" in err
+    assert [data._span(s) for s in (5, 300, 9000, 1e6)] == [
+        "5 seconds",
+        "5.0 minutes",
+        "2.5 hours",
+        "11.6 days",
+    ]
