@@ -3,13 +3,14 @@
 import ctypes
 import importlib
 import os
+import platform
 import re
 import sys
 import tempfile
 from dataclasses import dataclass
 from importlib import metadata
 
-from nma import llvm
+from nma import llvm, native
 from nma.errors import MissingDependencyError
 from nma.llvm import ensure_llvm
 
@@ -28,6 +29,12 @@ SYSTEM_PACKAGES = {
         "debian": "sudo apt-get install libatomic1",
         "fedora": "sudo dnf install libatomic",
         "arch": "sudo pacman -S gcc-libs",
+    },
+    "compiler": {
+        "debian": "sudo apt-get install g++",
+        "fedora": "sudo dnf install gcc-c++",
+        "arch": "sudo pacman -S gcc",
+        "macos": "xcode-select --install",
     },
     "nvidia": {
         "debian": "sudo apt-get install nvidia-driver (Ubuntu: sudo ubuntu-drivers install)",
@@ -57,16 +64,20 @@ def check() -> list[Finding]:
 
     The order is that of repair: a later finding may depend on an earlier one.
     """
-    needed = ("drjit", "mitsuba", "numpy", "safetensors", "zarr", "matplotlib")
+    needed = {"drjit": "", "mitsuba": "", "numpy": "", "safetensors": "", "zarr": "", "matplotlib": ""}
+    needed["PIL"] = "pillow"
     return [
+        _system(),
         _python(),
         *([_libatomic()] if sys.platform == "linux" else []),
         _llvm(),  # before the modules, as Dr.Jit looks for libLLVM when it is imported
-        *(_module(name) for name in needed),
+        *(_module(name, distribution=distribution) for name, distribution in needed.items()),
         _cuda(),
         *(_module(name, "training") for name in ("jax", "optax")),
         _module("flip_evaluator", "comparing images", "flip-evaluator"),
         _module("skimage", "comparing images", "scikit-image"),
+        _module("nanobind", "compiling plugins for scalar_rgb"),
+        _compiler(),
         _working_directory(),
     ]
 
@@ -74,6 +85,19 @@ def check() -> list[Finding]:
 def _advice(what: str) -> str:
     commands = SYSTEM_PACKAGES[what]
     return commands.get(llvm.platform(), f"install it with your package manager ({what})")
+
+
+def _system() -> Finding:
+    """Linux is what all tests run on."""
+    system = llvm.platform()
+    if system == "windows":
+        return Finding(
+            "system", False, "Windows is not supported, Linux in its WSL is", llvm.install_command()
+        )
+    found = f"{platform.system()} on {platform.machine()}"
+    if system == "macos":
+        found += ": should work on the CPU, but was never tested; Metal is not supported"
+    return Finding("system", True, found)
 
 
 def _python() -> Finding:
@@ -122,6 +146,14 @@ def _requirement(distribution: str) -> str:
         wanted = []
     specifiers = (line.partition(";")[0].strip() for line in wanted)
     return next((line for line in specifiers if re.split(r"[^\w.-]", line)[0] == distribution), distribution)
+
+
+def _compiler() -> Finding:
+    purpose = "for plugins of scalar_rgb and the C++ runtime in Python"
+    try:
+        return Finding("C++ compiler", True, native.compiler(), optional=True)
+    except MissingDependencyError:
+        return Finding("C++ compiler", False, f"{purpose}; there is none", _advice("compiler"), True)
 
 
 def _cuda() -> Finding:

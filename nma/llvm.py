@@ -43,13 +43,15 @@ _INSTALL = {
     "fedora": "sudo dnf install llvm-libs",
     "arch": "sudo pacman -S llvm-libs",
     "macos": "brew install llvm",
+    # Dr.Jit would take an LLVM-C.dll there, but nothing else of this package was ever tried.
+    "windows": "wsl --install (Windows is not supported, Linux in its WSL is)",
 }
 
 
 def platform() -> str:
-    """Whose package manager this system has: debian (also Ubuntu), fedora, arch, macos, or other."""
-    if sys.platform == "darwin":
-        return "macos"
+    """Whose package manager this system has: debian (also Ubuntu), fedora, arch, macos, or other; or windows."""
+    if sys.platform in ("darwin", "win32"):
+        return "macos" if sys.platform == "darwin" else "windows"
     try:
         release = Path("/etc/os-release").read_text(encoding="utf-8")
     except OSError:

@@ -74,7 +74,14 @@ def _fresh_search(monkeypatch):
 @pytest.mark.usefixtures("_fresh_search")
 @pytest.mark.parametrize(
     ("system", "command"),
-    [("debian", "apt-get"), ("fedora", "dnf"), ("arch", "pacman"), ("macos", "brew"), ("other", "install")],
+    [
+        ("debian", "apt-get"),
+        ("fedora", "dnf"),
+        ("arch", "pacman"),
+        ("macos", "brew"),
+        ("windows", "wsl"),
+        ("other", "install"),
+    ],
 )
 def test_a_system_without_libllvm_is_told_what_to_install(monkeypatch, system, command):
     monkeypatch.setattr(llvm, "candidates", list)
@@ -108,12 +115,38 @@ def test_libraries_are_ordered_by_number(tmp_path, monkeypatch):
 
 def test_findings_name_a_command_where_something_is_wrong():
     findings = doctor.check()
-    assert {"Python", "libLLVM", "drjit", "mitsuba", "CUDA", "jax", "working directory"} <= {
+    assert {"system", "Python", "libLLVM", "drjit", "CUDA", "jax", "nanobind", "C++ compiler"} <= {
         finding.name for finding in findings
     }
     for finding in findings:
         assert finding.found
         assert bool(finding.fix) != finding.ok
+
+
+@pytest.mark.parametrize(
+    ("system", "ok", "found"),
+    [
+        ("debian", True, "on"),
+        ("macos", True, "never tested; Metal is not supported"),
+        ("windows", False, "Windows is not supported"),
+    ],
+)
+def test_it_says_which_systems_are_supported(monkeypatch, system, ok, found):
+    monkeypatch.setattr(llvm, "platform", lambda: system)
+    finding = doctor.check()[0]
+    assert (finding.name, finding.ok, finding.optional) == ("system", ok, False)
+    assert found in finding.found
+    assert ok or finding.fix.startswith("wsl --install")
+
+
+def test_what_compiling_needs_is_optional(monkeypatch):
+    monkeypatch.setitem(sys.modules, "nanobind", None)
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
+    findings = {finding.name: finding for finding in doctor.check()}
+    for name, fix in (("nanobind", "pip install 'nanobind"), ("C++ compiler", "g++")):
+        assert not findings[name].ok and findings[name].optional
+        assert "scalar_rgb" in findings[name].found
+        assert fix in findings[name].fix or llvm.platform() != "debian"
 
 
 def test_a_missing_module_is_found_with_the_command_that_installs_it(monkeypatch):

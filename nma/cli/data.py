@@ -181,9 +181,11 @@ def _vectors(space, params, material, draw, population, seed):
 
 def _facts(material: Material) -> dict[str, Any]:
     """A material for other programs: its vector in the order of the class, null where images drive it, and by name."""
+    from nma.materials import Texture
+
     values = {
         name: {**asdict(value), "parameter": name, "path": str(value.path)}
-        if name in material.textures
+        if isinstance(value, Texture)
         else value
         for name, value in material.values.items()
     }
