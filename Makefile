@@ -1,5 +1,6 @@
 # make demo    one picture of the whole path: out/demo.png
-# make test    lint and tests
+# make test    lint and tests, in minutes
+# make test-all   those, types, the experiments and benches in their quick forms: what continuous integration runs
 # make figures list the experiments, and how to run them: make figures ARGS=all, or ARGS="shipped --quick"
 # make types   the type checker
 # make wheel   dist/*.whl
@@ -7,17 +8,24 @@
 # All of them set up .venv first; see tools/setup.sh.
 BIN := .venv/bin
 WORKERS ?= 2
+PYTEST = $(BIN)/python -m pytest --quiet --numprocesses $(WORKERS) --dist worksteal
 
-.PHONY: demo test figures types wheel lock
+.PHONY: demo test test-all lint figures types wheel lock
 demo:
 	@tools/setup.sh demo
 	$(BIN)/nma demo
 
-test:
+test: lint
+	$(PYTEST) $(ARGS)
+
+# One session, so that its summary is the last that is printed.
+test-all: lint types
+	$(PYTEST) -m "slow or not slow" $(ARGS)
+
+lint:
 	@tools/setup.sh test
 	$(BIN)/ruff check --quiet .
 	$(BIN)/ruff format --quiet --check .
-	$(BIN)/python -m pytest --quiet --numprocesses $(WORKERS) $(ARGS)
 
 figures:
 	@tools/setup.sh test

@@ -1,5 +1,6 @@
 """What several test files share."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -37,10 +38,16 @@ def compiler() -> str:
 
 @pytest.fixture(scope="session")
 def measurements() -> Path:
-    """Measured materials, in a folder beside the checkout: the repository holds none of them."""
-    folder = Path(__file__).parents[2] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"there are no measured materials in {folder}; `nma data` says where they come from")
+    """The folder of measured materials: NMA_TEST_DATA, or one beside the checkout; the repository holds none."""
+    named = os.environ.get("NMA_TEST_DATA")
+    folder = Path(named or Path(__file__).parents[2] / "shared/data")
+    missing = [name for name in ("rgl", "rgl_nbrdf", "merl_nbrdf") if not (folder / name).is_dir()]
+    if missing:
+        reason = (
+            f"no measured materials in {', '.join(missing)} of {folder}: NMA_TEST_DATA names another folder, "
+            "`nma data` says where they come from"
+        )
+        (pytest.fail if named else pytest.skip)(reason)
     return folder
 
 

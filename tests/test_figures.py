@@ -23,6 +23,7 @@ def figures(*words):
     return subprocess.run(command, env={**os.environ, **flags}, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_quick(name):
     folder = ROOT / "out/figures" / name
