@@ -3,6 +3,7 @@ that Python calls for many queries at once.
 
 What is built lies in the user's cache, in a folder named by the digest of the sources and of all versions that matter:
 a newer package or Mitsuba builds anew and never loads what does not fit it. Compilers: `CXX`, else c++, g++ or clang++.
+Linux is tested, macOS is meant to work, Windows is refused.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import platform
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -64,7 +66,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
 
     Raises:
         MissingDependencyError: no compiler, or no headers of nanobind, which Dr.Jit's include.
-        BuildError: the compiler refused.
+        BuildError: the compiler refused, or this is Windows.
     """
     folder = mitsuba_folder()
     if folder.exists():
@@ -80,14 +82,15 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         *(f"-isystem{h}" for h in headers),
     ]
     flags += [f"-L{mitsuba}", f"-L{drjit}", "-lmitsuba", "-ldrjit-core", "-ldrjit-extra"]
-    flags.append("-Wl,--allow-shlib-undefined")
+    flags.append(_leave_undefined())
 
     def make(into: Path) -> None:
         (into / "plugins").mkdir()
         for name in PLUGINS:
-            say(f"compiling {name}.so")
+            plugin = into / "plugins" / f"{name}{_suffix()}"
+            say(f"compiling {plugin.name}")
             # Libraries come after what needs them.
-            _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", into / "plugins" / f"{name}.so"], flags)
+            _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", plugin], flags)
         shutil.copytree(Path(__file__).parent / "adapters", into / "adapters")
 
     _whole(folder, make)
@@ -98,18 +101,34 @@ def library() -> Path:
     """The C interface as a shared library, compiled unless it is there. Raises as `build_mitsuba`."""
     folder = _cache() / f"library-{_digest()}"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", f"-I{sources()}"]
-    _whole(folder, lambda into: _compile([sources() / "nma_c.cpp", "-o", into / "nma_c.so"], flags))
-    return folder / "nma_c.so"
+    name = f"nma_c{_suffix()}"
+    _whole(folder, lambda into: _compile([sources() / "nma_c.cpp", "-o", into / name], flags))
+    return folder / name
 
 
 def compiler() -> str:
-    """The C++ compiler. Raises `MissingDependencyError`."""
+    """The C++ compiler. Raises `MissingDependencyError`, on Windows `BuildError`."""
+    if sys.platform == "win32":
+        raise BuildError(
+            "Windows is not supported: the C++ runtime is compiled on Linux, and untested on macOS; take WSL, or the "
+            "variants llvm_ad_rgb and cuda_ad_rgb, which need no compiler"
+        )
     for name in filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")):
         if found := shutil.which(name):
             return found
     raise MissingDependencyError(
         "no C++ compiler found; install one (Debian: sudo apt-get install g++), or name it in CXX"
     )
+
+
+def _suffix() -> str:
+    """Of a library, as Mitsuba looks for its plugins."""
+    return ".dylib" if sys.platform == "darwin" else ".so"
+
+
+def _leave_undefined() -> str:
+    """What tells the linker that Mitsuba's libraries bring along symbols of their own."""
+    return "-Wl,-undefined,dynamic_lookup" if sys.platform == "darwin" else "-Wl,--allow-shlib-undefined"
 
 
 def _whole(folder: Path, make: Callable[[Path], None]) -> None:

@@ -29,6 +29,31 @@ def test_without_a_compiler_the_message_says_what_to_install(monkeypatch):
         native.compiler()
 
 
+@pytest.mark.parametrize(
+    "platform, suffix, flag",
+    [("linux", ".so", "-Wl,--allow-shlib-undefined"), ("darwin", ".dylib", "-Wl,-undefined,dynamic_lookup")],
+)
+def test_plugins_are_named_and_linked_as_the_platform_wants(monkeypatch, tmp_path, platform, suffix, flag):
+    compiled = []
+    monkeypatch.setattr(native.sys, "platform", platform)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(native, "_compile", lambda words, flags: compiled.append((words[-1].name, flags[-1])))
+    native.build_mitsuba()
+    assert compiled == [(f"nma{suffix}", flag), (f"layered{suffix}", flag)]
+    assert native.library().name == f"nma_c{suffix}"
+
+
+def test_windows_is_refused_in_one_line(monkeypatch, tmp_path):
+    monkeypatch.setattr(native.sys, "platform", "win32")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for build in (native.build_mitsuba, native.library):
+        with pytest.raises(
+            native.BuildError, match="Windows is not supported: .* Linux, and untested on macOS"
+        ) as e:
+            build()
+        assert "\n" not in str(e.value)
+
+
 def test_what_the_compiler_says_is_passed_on(tmp_path):
     source = tmp_path / "broken.cpp"
     source.write_text("int main() { return nothing; }\n")

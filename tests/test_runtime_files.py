@@ -13,6 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from nma.adapter import Adapter
 from nma.errors import WeightsError
 from nma.export.classes import classes
 from nma.export.cpp import cpp, print_function
@@ -140,11 +141,13 @@ def test_files_that_make_no_sense_are_refused(tmp_path, data, message):
     ],
 )
 def test_files_that_are_not_to_be_believed_are_refused(tmp_path, data, message):
-    """Their numbers would become NaN, negative, or garbage that looks like values."""
+    """Their numbers would become NaN, negative, or garbage that looks like values. The package refuses the same."""
     path = tmp_path / "bad.safetensors"
     path.write_bytes(data)
     with pytest.raises(WeightsError, match=re.escape(f"{path}: ") + ".*" + re.escape(message)):
         Runtime(path)
+    with pytest.raises(WeightsError):
+        Adapter.load(path)
 
 
 @pytest.mark.usefixtures("compiler")
@@ -157,6 +160,7 @@ def test_what_is_unusual_but_sound_loads(tmp_path):
     ):
         path.write_bytes(data)
         assert Runtime(path).parameters == 13
+        assert Adapter.load(path).space.size == 13
 
 
 def test_the_generated_headers_are_those_of_the_present_package():
