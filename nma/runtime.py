@@ -50,6 +50,7 @@ class Runtime:
         parameters: numbers of a material that it takes, the columns of `params`.
         names: the parameter that each column belongs to.
         low, high: the training range of each column.
+        material: the parameters of the only material that it knows, whatever their ranges; None of a class.
         size: numbers that the network returns.
         instruction_set: the one in use.
         anisotropic: whether the view's azimuth matters.
@@ -75,6 +76,7 @@ class Runtime:
         self.parameters = self._library.nma_parameter_count(self._handle)
         self.names = [self._name(k) for k in range(self.parameters)]
         self.low, self.high = self._ranges()
+        self.material = self._single_material()
         self.size = self._library.nma_output_count(self._handle)
         self.anisotropic = bool(self._library.nma_anisotropic(self._handle))
         self.instruction_set = INSTRUCTION_SETS[self._library.nma_instruction_set(self._handle)]
@@ -127,9 +129,22 @@ class Runtime:
             self._library.nma_parameter_range(self._handle, column, _pointer(pair))
         return ends[:, 0], ends[:, 1]
 
+    def _single_material(self) -> Array | None:
+        numbers = np.empty(self.parameters, np.float32)
+        return numbers if self._library.nma_single_material(self._handle, _pointer(numbers)) else None
+
     def _checked(self, params: ArrayLike, clamp: bool) -> Array:
-        """Rows of parameters within the training range."""
+        """Rows of parameters within the training range, or of the only material known."""
         rows = _rows("params", params, self.parameters)
+        if self.material is not None:
+            other = ~np.isclose(rows, self.material, rtol=1e-5)
+            if other.any():
+                row, column = np.argwhere(other)[0]
+                raise ParamError(
+                    f"{self.names[column]} of row {row} is {rows[row, column]:g}, but the adapter knows a single "
+                    f"material, whose own is {self.material[column]:g}; fit one to that material"
+                )
+            return rows
         slack = 1e-6 * np.maximum(np.abs(self.low), 1.0)
         inside = np.isfinite(rows) if clamp else (rows >= self.low - slack) & (rows <= self.high + slack)
         if not inside.all():

@@ -107,15 +107,18 @@ public:
     // Numbers that `prepare` takes, in the order of `parameters`.
     int parameter_count() const { return recipe_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
+    // The parameters of the only material that it knows, fitted to that; empty where it knows a class. `prepare` does not read them.
+    const std::vector<float>& material() const { return weights_.material; }
     // The number of the first of them that is not finite or beyond its training range, where the network makes up plausible
-    // values; -1 if there is none. `parameter` says which parameter it belongs to.
+    // values, or, if it knows a single material, not of that; -1 if there is none. `parameter` says whose number it is.
     int check(const float* parameters) const {
         for (int k = 0; k < parameter_count(); ++k)
-            if (!parameter(k).allows(parameters[k])) return k;
+            if (!knows(k, parameters[k])) return k;
         return -1;
     }
-    // Moves each into its training range, NaN to the lower end.
+    // Moves each into its training range, NaN to the lower end; where it knows a single material, there is nothing to move.
     void clamp(float* parameters) const {
+        if (!material().empty()) return;
         for (int k = 0; k < parameter_count(); ++k) parameters[k] = parameter(k).clamped(parameters[k]);
     }
     const SourceParam& parameter(int number) const { return weights_.parameters[owners_[number]]; }
@@ -199,6 +202,12 @@ private:
     }
 
     const Kernels& kernels() const { return network_.kernels_in_use(); }
+
+    // Whether a material may have x for its parameter number `k`.
+    bool knows(int k, float x) const {
+        if (material().empty()) return parameter(k).allows(x);
+        return is_finite(x) && absolute(x - material()[k]) <= 1e-5f * absolute(material()[k]) + 1e-8f;
+    }
 
     // Remembers which fields of a `Principled` the numbers of a parameter become.
     void add_fields(const TargetParam& p) {

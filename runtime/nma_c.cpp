@@ -90,6 +90,10 @@ void nma_parameter_range(const nma_adapter* a, int number, float range[2]) {
     range[0] = static_cast<float>(p.low);
     range[1] = static_cast<float>(p.high);
 }
+int nma_single_material(const nma_adapter* a, float* parameters) {
+    std::copy(a->adapter.material().begin(), a->adapter.material().end(), parameters);
+    return !a->adapter.material().empty();
+}
 int nma_check(const nma_adapter* a, const float* parameters) { return a->adapter.check(parameters); }
 void nma_clamp(const nma_adapter* a, float* parameters) { a->adapter.clamp(parameters); }
 int nma_output_count(const nma_adapter* a) { return a->adapter.output_count(); }

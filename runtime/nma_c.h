@@ -47,7 +47,10 @@ NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
 /* Of the parameter number `number`, counted from 0: the parameter's name, and its training range, low and high. */
 NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int number);
 NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int number, float range[2]);
-/* The first number that is not finite or beyond its training range, where values are made up; -1 if there is none. */
+/* Whether it knows a single material of its class; the parameters of that are written then. */
+NMA_C_API int nma_single_material(const nma_adapter* adapter, float* parameters);
+/* The first number that is not finite or beyond its training range, where values are made up, or not of the single
+ * material that it knows; -1 if there is none. */
 NMA_C_API int nma_check(const nma_adapter* adapter, const float* parameters);
 /* Moves each into its training range, NaN to the lower end. */
 NMA_C_API void nma_clamp(const nma_adapter* adapter, float* parameters);

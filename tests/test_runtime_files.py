@@ -7,17 +7,20 @@ import re
 import struct
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from adapter_cases import random_adapter
 
 from nma.adapter import Adapter
-from nma.errors import WeightsError
+from nma.errors import ParamError, WeightsError
 from nma.export.classes import classes
 from nma.export.cpp import cpp, print_function
 from nma.export.functions import Unsupported, parsed
+from nma.params import LAYERED3
 from nma.runtime import Runtime
 
 ROOT = Path(__file__).parent.parent
@@ -161,6 +164,31 @@ def test_what_is_unusual_but_sound_loads(tmp_path):
         path.write_bytes(data)
         assert Runtime(path).parameters == 13
         assert Adapter.load(path).space.size == 13
+
+
+@pytest.mark.usefixtures("compiler")
+def test_weights_of_one_material_know_which(tmp_path):
+    """As nma.adapter.Adapter.check has it: to rounding, whatever the training range."""
+    path, vector = tmp_path / "one.safetensors", LAYERED3.sample(np.random.default_rng(0), 1)[0]
+    vector[12] = 3.0
+    adapter = random_adapter(hidden="1x8", name="direction")
+    replace(adapter, training={"params": vector.tolist()}).save(path)
+    runtime, mu = Runtime(path), np.float32([0.5])
+    np.testing.assert_allclose(runtime.material, vector, rtol=1e-6)
+    own = vector[None].astype(np.float32)
+    assert np.isfinite(runtime.outputs(own, mu)).all()
+    other = own * np.where(np.arange(13) == 9, 1.001, 1)
+    for clamp in (False, True):
+        with pytest.raises(
+            ParamError, match="albedo of row 0 is .*, but the adapter knows a single material"
+        ):
+            runtime.prepare(other, mu, clamp=clamp)
+    for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13):
+        replace(adapter, training={"params": params}).save(path)
+        with pytest.raises(WeightsError, match="its material is none of class layered3"):
+            Runtime(path)
+    adapter.save(path)
+    assert Runtime(path).material is None
 
 
 def test_the_generated_headers_are_those_of_the_present_package():

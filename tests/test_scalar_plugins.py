@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from adapter_cases import random_anisotropic_adapter
+from adapter_cases import random_adapter, random_anisotropic_adapter
 from scalar_cases import MATERIAL, finished, own_cache
 
 from nma.image_io import write_exr, write_png
@@ -299,6 +299,12 @@ COLOUR = {"type": "rgb", "value": [0.1, 0.5, 0.9]}
 
 def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
     """Numbers of sRGB 128: .2158605 (IEC 61966-2-1), 128 / 255 where the texture is `raw`."""
+    one = str(tmp_path / "one.safetensors")
+    known = [
+        x for value in MATERIAL.values() for x in (value["value"] if isinstance(value, dict) else [value])
+    ]
+    adapter = random_adapter(hidden="1x8", name="direction")
+    dataclasses.replace(adapter, training={"params": known}).save(one)
     coloured, shared = bitmap([0.1, 0.2, 0.3]), {"type": "srgb", "color": [0.1, 0.5, 0.9]}
     cases = [
         ({"sigma_t": 7.0}, "sigma_t is 7, allowed is 0 .. 1, the range"),
@@ -333,6 +339,10 @@ def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
             "the texture of sigma_t holds -1 at x=1, y=2, one of 3",
         ),
         ({"sigma_t": bitmap(7.0), "type": "layered"}, None),
+        ({"adapter": one, "sigma_t": 0.5}, None),
+        ({"adapter": one, **dict.fromkeys(MATERIAL)}, None),
+        ({"adapter": one, "sigma_t": 0.6}, "knows a single material, whose sigma_t is 0.5, not 0.6"),
+        ({"adapter": one, "sigma_t": bitmap(0.5)}, "so that no texture can drive sigma_t"),
         ({"eta_top": png(tmp_path, False)}, "the texture of eta_top holds 0.21586 at x=0, y=0"),
         ({"eta_top": png(tmp_path, True)}, "the texture of eta_top holds 0.501961"),
         (

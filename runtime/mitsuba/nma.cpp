@@ -17,6 +17,7 @@ class NmaBSDF final : public SourceBSDF<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(SourceBSDF, m_flags, m_components, inputs_, hidden)
     MI_IMPORT_TYPES()
+    using typename Base::Inputs;
 
     explicit NmaBSDF(const Properties& props) : NmaBSDF(props, load(adapter_name(props), props.get<std::string_view>("precision", "float32"))) {}
 
@@ -57,12 +58,35 @@ private:
     static constexpr int MOST_PARAMETERS = 64;
 
     NmaBSDF(const Properties& props, nma::Adapter adapter)
-        : Base(props, adapter.parameters(), true), name_(adapter_name(props)), adapter_(std::move(adapter)), online_(props.get<bool>("online", false)) {
+        : Base(props, wanted(props, adapter), true), name_(adapter_name(props)), adapter_(std::move(adapter)), online_(props.get<bool>("online", false)) {
         if (adapter_.anisotropic()) m_flags = m_components[0] = m_flags | BSDFFlags::Anisotropic;
         tabulate();
     }
 
     static std::string adapter_name(const Properties& props) { return std::string(props.get<std::string_view>("adapter", "layered3-5x64")); }
+
+    // The parameters that it takes: those of its class, or none where it knows a single material, whose own may be given all
+    // the same.
+    static std::vector<SourceParam> wanted(const Properties& props, const nma::Adapter& adapter) {
+        if (adapter.material().empty()) return adapter.parameters();
+        const float* known = adapter.material().data();
+        for (SourceParam p : adapter.parameters()) {
+            if (props.has_property(p.name)) refuse_others(props, p, known);
+            known += p.size;
+        }
+        return {};
+    }
+
+    static void refuse_others(const Properties& props, SourceParam p, const float* known) {
+        p.low = -1e30, p.high = 1e30;
+        const Inputs given(props, {p}, false);
+        if (given.textured()) Throw("the adapter knows a single material, so that no texture can drive %s; leave it out", p.name);
+        float numbers[MOST_PARAMETERS];
+        given.at(dr::zeros<SurfaceInteraction3f>(), numbers);
+        for (int c = 0; c < p.size; ++c)
+            if (nma::absolute(numbers[c] - known[c]) > 1e-5f * nma::absolute(known[c]) + 1e-8f)
+                Throw("the adapter knows a single material, whose %s is %g, not %g; fit one to that material, or take the adapter of a class", p.name, known[c], numbers[c]);
+    }
 
     // Curves of the present inputs, where a material has such.
     void tabulate() {

@@ -56,6 +56,8 @@ struct Weights {
     std::vector<Layer> layers;
     int instances = 0;
     bool directional = false, bounded = false;
+    // The parameters of the only material that the network was fitted to; empty where it knows its class, or where that has none.
+    std::vector<float> material;
 };
 
 namespace detail {
@@ -202,6 +204,20 @@ inline TargetParam target_param(const Json& entry) {
     return p;
 }
 
+// What the record of a fit says of its only material, if the network reads no parameters but knows those of one.
+inline std::vector<float> material(const Json& about, const Weights& made) {
+    std::size_t size = 0;
+    for (const SourceParam& p : made.parameters) size += static_cast<std::size_t>(p.size);
+    const Json* training = about.find("training");
+    const Json* fitted = training ? training->find("params") : nullptr;
+    if (!fitted || !size || (made.encoding != "direction" && made.encoding != "azimuth")) return {};
+    std::vector<float> found;
+    for (const Json& item : fitted->items)
+        if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30) found.push_back(static_cast<float>(item.number));
+    if (found.size() != size || fitted->items.size() != size) throw Error("its material is none of class " + made.class_name + "; fit it again");
+    return found;
+}
+
 inline Weights weights(const char* bytes, std::size_t size) {
     std::uint64_t length = 0;
     if (size < 8) throw Error("too short for a weights file");
@@ -219,6 +235,7 @@ inline Weights weights(const char* bytes, std::size_t size) {
     made.bounded = flag(about, "bounded");
     for (const Json& entry : about.at("parameters", Json::Kind::Array).items) made.parameters.push_back(source_param(entry));
     for (const Json& entry : about.at("target", Json::Kind::Array).items) made.target.push_back(target_param(entry));
+    made.material = material(about, made);
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
     if (hidden.size() >= DEEPEST) throw Error("a network of too many layers");
