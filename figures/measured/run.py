@@ -162,7 +162,7 @@ def alternatives(
     if material.source.isotropic:
         path = kept / f"{slug(material)}_constant_{constant_steps}.safetensors"
         if not path.exists():
-            recipe = replace(CONSTANT, steps=constant_steps)
+            recipe = replace(CONSTANT, steps=constant_steps, albedo=0.0)  # as the results here were fitted
             fit_constant(tabulate_values(material.source), recipe).adapter.save(path)
         constant = Adapter.load(path)
         found["constant Principled"] = AdapterValues(constant), constant.size

@@ -12,6 +12,9 @@ import typer
 from nma import files
 from nma.cli import console, options
 
+# Mean error of the directional albedo above which plain numbers come with a warning: it shows in pictures.
+ALBEDO_LIMIT = 0.05
+
 
 def register(app: typer.Typer) -> None:
     app.command()(principled)
@@ -64,10 +67,14 @@ def principled(
         fit = fit_constant(tables, recipe, record, progress=bar.update)
     description = principled_dict(fit.principled)
     print(_json(description))
+    error = fit.figures["albedo_error"]
     console.err.print(
-        f"log loss {fit.log_loss:.5f} over the table, albedo error {fit.figures['albedo_error']:.4f}",
+        f"log loss {fit.log_loss:.5f} over the table, albedo error {error:.4f}",
         highlight=False,
+        soft_wrap=True,
     )
+    if error > ALBEDO_LIMIT:
+        console.err.print(_warning(error, fit.brightness), highlight=False, soft_wrap=True)
     if output is None:
         return
     if output.suffix == ".safetensors":
@@ -76,6 +83,16 @@ def principled(
         text = principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
         files.write_bytes(output, text.encode())
     console.err.print(f"wrote {output}", highlight=False, soft_wrap=True)
+
+
+def _warning(error: float, brightness: float) -> str:
+    """What to know of numbers that cannot show the material."""
+    percent = 100.0 * (brightness - 1.0)
+    tone = "bright" if percent > 0 else "dark"
+    return (
+        f"warning: an albedo error of {error:.4f} is above {ALBEDO_LIMIT:g} ({abs(percent):.1f} % too {tone} in all): "
+        "one plain Principled BRDF cannot show this material, an adapter of `nma fit` can"
+    )
 
 
 def _json(description: dict[str, Any]) -> str:
