@@ -24,11 +24,11 @@ err = Console(stderr=True)
 def progress(unit: str) -> Progress:
     """A progress bar with a rate in `unit` (the field `rate`), a note (the field `note`) and the time left."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]} " + unit),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),

@@ -119,3 +119,11 @@ def test_a_dataset_says_how_long_it_will_take(nma, tmp_path):
         "2.5 hours",
         "11.6 days",
     ]
+
+
+def test_paths_are_printed_as_they_are(nma, tmp_path):
+    """On lines as long as they need, brackets and all."""
+    path = tmp_path / "a folder [bold] of {many} letters in its name" / ("n" * 60 + "[/x].npz")
+    code, _, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", path)
+    assert code == 0
+    assert f"{path}: 1 material(s), 1,600 walks each\n" in err

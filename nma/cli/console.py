@@ -13,7 +13,7 @@ from rich.table import Table
 
 from nma.progress import TrainingBar, err, progress
 
-__all__ = ["TrainingBar", "err", "loss_plot", "number", "out", "progress", "table"]
+__all__ = ["TrainingBar", "err", "loss_plot", "number", "out", "progress", "say", "table", "tell"]
 
 out = Console()
 
@@ -34,6 +34,16 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str 
     ]
     parts: list[RenderableType] = [f"[bold]{escape(title)}[/bold]"] if title else []
     return Group(*parts, *(_table([columns[0], *part]) for part in _parts(columns)))
+
+
+def say(text: str) -> None:
+    """A line on stderr as it is: paths are not broken, and brackets are no markup."""
+    err.print(text, soft_wrap=True, markup=False, highlight=False)
+
+
+def tell(text: str) -> None:
+    """The same on stdout."""
+    out.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 def number(value: float) -> str:

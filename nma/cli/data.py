@@ -117,7 +117,7 @@ def simulate(
             bar.update(task, completed=len(tables), rate=f"{rate:.1f}")
     Tables.concatenate(tables).save(output)
     shutil.rmtree(parts, ignore_errors=True)
-    console.err.print(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
+    console.say(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
 
 
 def dataset(
@@ -144,11 +144,11 @@ def dataset(
             bar.update(task, completed=done, rate=f"{rate:.1f}")
             if rate and not told:
                 left = (materials - done) * walks / (1e6 * rate)
-                console.err.print(f"{_span(left)} to go at {rate:.1f} million walks per second")
+                console.say(f"{_span(left)} to go at {rate:.1f} million walks per second")
                 told = True
 
         data.write(progress)
-    console.err.print(f"{output}: complete, {materials} materials")
+    console.say(f"{output}: complete, {materials} materials")
 
 
 def _span(seconds: float) -> str:

@@ -32,7 +32,7 @@ def listing(context: typer.Context) -> None:
         for name, (size, checksum) in dataset.known.items():
             lines[name] = f"{size:,} bytes, SHA-256 {checksum}"
         for name, text in lines.items():
-            console.out.print(f"  {name}: {text}", highlight=False, soft_wrap=True)
+            console.tell(f"  {name}: {text}")
         if n + 1 < len(DATASETS):
             console.out.print()
 
@@ -48,6 +48,6 @@ def check(path: Annotated[Path, typer.Argument(help="A file, or a folder that ho
     findings = list(datasets.check(path))
     for f in findings:
         line = f"{'ok' if f.ok else 'FAULT':5}  {f.dataset:10}  {f.path}: {f.note}"
-        console.out.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.tell(line)
     if not all(f.ok for f in findings):
         raise typer.Exit(1)

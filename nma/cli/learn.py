@@ -240,7 +240,7 @@ def _compare(adapter, source) -> None:
 
     figures = compare(AdapterValues(adapter), source)
     listed = ", ".join(f"{name} {value:.5f}" for name, value in figures.items())
-    console.err.print(f"against {source.name} at {PAIRS:,} pairs of directions: {listed}", soft_wrap=True)
+    console.say(f"against {source.name} at {PAIRS:,} pairs of directions: {listed}")
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
@@ -289,7 +289,7 @@ def _finish(adapter, run, output: Path) -> None:
 
     adapter.save(output)
     plot = plot_losses(run.log_losses, console.loss_plot(output), output.name)
-    console.err.print(
+    console.say(
         f"{output}: {adapter.variant}, {run.step} steps in {run.seconds:.0f} s, "
         f"log loss of the last steps {np.mean(run.log_losses[-500:]):.5f} (against noisy bins); losses in {plot}"
     )

@@ -74,14 +74,13 @@ def train_library(
     plot = plot_losses(run.log_losses, console.loss_plot(output), output.name)
     checkpoint.unlink(missing_ok=True)
     recent = run.log_losses[-500:]
-    console.err.print(
+    console.say(
         f"{output}: {run.step} steps in {run.seconds:.0f} s, log loss of the last steps "
         f"{sum(recent) / len(recent):.5f}; losses in {plot}"
     )
-    console.out.print(
+    console.tell(
         f"{len(names)} materials ({record['data']}), {made.parameters:,} parameters: {made.codes.size:,} of codes, "
-        f"{made.parameters - made.codes.size:,} of the network",
-        highlight=False,
+        f"{made.parameters - made.codes.size:,} of the network"
     )
 
 
@@ -91,7 +90,7 @@ def listing(path: _Library) -> None:
     from nma.library import Library
 
     for name in Library.load(path).names:
-        console.out.print(name, highlight=False, markup=False, soft_wrap=True)
+        console.tell(name)
 
 
 @library.command()
@@ -129,11 +128,10 @@ def encode(
     with console.TrainingBar(recipe, "encoding") as bar:
         found = training.encode(known, tables, recipe=recipe, progress=bar.update)
     known.add(name, found.code).save(output)
-    console.err.print(f"{output}: {name} added in {time.perf_counter() - began:.0f} s")
-    console.out.print(
+    console.say(f"{output}: {name} added in {time.perf_counter() - began:.0f} s")
+    console.tell(
         f"{name}: log loss {found.log_loss:.5f}; the nearest of the library, {found.nearest}, has "
-        f"{found.nearest_log_loss:.5f}",
-        highlight=False,
+        f"{found.nearest_log_loss:.5f}"
     )
 
 
@@ -156,7 +154,7 @@ def extract(
     shares = dict(_share(text) for text in materials)
     code = known.mix(list(shares), list(shares.values()))
     known.material(code, " ".join(materials)).save(output)
-    console.err.print(f"{output}: {' '.join(materials)}")
+    console.say(f"{output}: {' '.join(materials)}")
 
 
 def _share(text: str) -> tuple[str, float]:

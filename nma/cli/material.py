@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,7 @@ def tables_of(
         raise SourceError(f"{source}: {known.name} is anisotropic, only isotropic materials can be fitted")
     began = time.perf_counter()
     tables = tabulate_values(known, points=POINTS)
-    console.err.print(f"tabulated {known.name} in {time.perf_counter() - began:.1f} s")
+    console.say(f"tabulated {known.name} in {time.perf_counter() - began:.1f} s")
     return tables, {**record, "points_per_bin": POINTS}
 
 
@@ -69,7 +70,7 @@ def _simulated(name: str, walks: int, seed: int) -> tuple[Tables, dict[str, Any]
     began = time.perf_counter()
     source = sources.get(material.class_name)
     tables = tabulate(source, vector[None], walks, stream_keys(seed, range(1)), error=False)
-    console.err.print(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
+    console.say(f"simulated {walks:,} walks in {time.perf_counter() - began:.1f} s")
     record = {"data": f"material {name}", "material": material.name, "walks_per_material": walks}
     return tables, record
 
@@ -99,7 +100,7 @@ def _number(path: Path, count: int, material: str | None) -> int:
     """Which of a reference file's materials is meant."""
     if material is None and count == 1:
         return 0
-    if material is None or not material.isdecimal() or int(material) >= count:
+    if material is None or not re.fullmatch(r"\d{1,9}", material, re.ASCII) or int(material) >= count:
         given = "" if material is None else f", not {material!r}"
         raise TableError(
             f"{path}: holds {count} material(s); choose one with --material 0 .. {count - 1}{given}"

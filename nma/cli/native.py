@@ -18,8 +18,8 @@ def build() -> None:
     """Compile the BSDFs nma and layered for scalar_rgb against the installed Mitsuba, some ten seconds, once."""
     from nma import native
 
-    folder = native.build_mitsuba(console.err.print)
-    console.err.print(
+    folder = native.build_mitsuba(console.say)
+    console.say(
         f'In Python: nma.render.use("scalar_rgb"). On the command line: mitsuba -a {folder} -m scalar_rgb SCENE.xml'
     )
     print(folder)

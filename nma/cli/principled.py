@@ -68,13 +68,11 @@ def principled(
     description = principled_dict(fit.principled)
     print(_json(description))
     error = fit.figures["albedo_error"]
-    console.err.print(
+    console.say(
         f"log loss {fit.log_loss:.5f} over the table, albedo error {error:.4f}",
-        highlight=False,
-        soft_wrap=True,
     )
     if error > ALBEDO_LIMIT:
-        console.err.print(_warning(error, fit.brightness), highlight=False, soft_wrap=True)
+        console.say(_warning(error, fit.brightness))
     if output is None:
         return
     if output.suffix == ".safetensors":
@@ -82,7 +80,7 @@ def principled(
     else:
         text = principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
         files.write_bytes(output, text.encode())
-    console.err.print(f"wrote {output}", highlight=False, soft_wrap=True)
+    console.say(f"wrote {output}")
 
 
 def _warning(error: float, brightness: float) -> str:

@@ -73,7 +73,7 @@ def doctor() -> None:
     # Commands stand alone, unbroken, to be copied.
     for f in findings:
         if not f.ok:
-            console.out.print(f"\n{f.name}:\n  {f.fix}", markup=False, highlight=False, soft_wrap=True)
+            console.tell(f"\n{f.name}:\n  {f.fix}")
     if not all(f.ok or f.optional for f in findings):
         raise typer.Exit(1)
 

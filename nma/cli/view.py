@@ -195,7 +195,7 @@ def compare(
         print(json.dumps(errors[first] | ({"noise": errors["noise"]} if "noise" in errors else {})))
         return
     rows = [(metric, *(values[metric] for values in errors.values())) for metric in image_metrics.METRICS]
-    console.out.print(f"{test} against {reference or 'its reference'}", highlight=False)
+    console.tell(f"{test} against {reference or 'its reference'}")
     console.out.print(console.table(("", *errors), rows))
 
 
@@ -226,7 +226,7 @@ def demo(
         rows = [line.cells()[1:] for line in lines if line.material == material]
         console.out.print(console.table(demonstration.HEADINGS[1:], rows, material))
     console.out.print(demonstration.note(settings), highlight=False)
-    console.err.print(f"[bold]{output}[/bold] shows the pictures")
+    console.say(f"{output} shows the pictures")
 
 
 _PREVIEW = ("camera", "lighting", "envmap", "mesh", "mesh_up", "depth")  # of the preview scene
@@ -294,7 +294,7 @@ def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float)
     names = channel_names(scene, image.shape[2])
     write_exr(pictures[0], image, names)
     write_png(pictures[1], colours(image, names), exposure=exposure)
-    console.err.print(f"{pictures[0]} (linear), {pictures[1]}")
+    console.say(f"{pictures[0]} (linear), {pictures[1]}")
 
 
 def _write_difference(path: Path, title: str, name: str, test: Any, reference: Any, exposure: float) -> None:
@@ -305,7 +305,7 @@ def _write_difference(path: Path, title: str, name: str, test: Any, reference: A
     contact_sheet(
         path, [Row(title, [reference, test, difference])], ("reference", name, "FLIP"), exposure=exposure
     )
-    console.err.print(f"{path}: reference, {name}, and FLIP from black (0) to yellow (1)")
+    console.say(f"{path}: reference, {name}, and FLIP from black (0) to yellow (1)")
 
 
 def _pixels(text: str) -> tuple[int, int]:
