@@ -27,6 +27,7 @@ from nma.image_io import ImageError, as_image, tonemap
 
 Image = NDArray[np.float32]
 EPS = 0.01
+SMALLEST = 11  # pixels across, the window of ssim
 METRICS = ("l1", "l2", "mape", "smape", "mrse", "ssim", "flip_hdr", "flip_ldr")
 
 
@@ -47,15 +48,20 @@ def compare_images(
         ImageError: different shapes, too small an image, NaN or infinity.
     """
     a, b = _pair(test, reference)
-    if min(a.shape[:2]) < 11:
-        raise ImageError(
-            f"images of {a.shape[1]} x {a.shape[0]} pixels are too small for ssim; it needs 11 x 11"
-        )
+    check_size((a.shape[1], a.shape[0]))
     error = errors(a, b, eps=eps)
     error["ssim"] = _ssim(tonemap(a, exposure=ldr_exposure), tonemap(b, exposure=ldr_exposure))
     error["flip_hdr"] = float(flip_map(a, b, hdr=True).mean(dtype=np.float64))
     error["flip_ldr"] = float(flip_map(a, b, exposure=ldr_exposure).mean(dtype=np.float64))
     return {name: error[name] for name in METRICS}
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raises `ImageError` for images that are too small to be compared."""
+    if min(size) < SMALLEST:
+        raise ImageError(
+            f"images of {size[0]} x {size[1]} pixels are too small for ssim; it needs {SMALLEST} x {SMALLEST}"
+        )
 
 
 def errors(test: ArrayLike, reference: ArrayLike, *, eps: float = EPS) -> dict[str, float]:

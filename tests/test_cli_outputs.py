@@ -103,6 +103,24 @@ def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, mo
     assert not Path("out").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("demo", "--adapter", "no-such"), "no-such"),
+        (("demo", "--size", 8), "too small for ssim"),
+        (("compare", "gold-red-lacquer", "--size", 8), "too small for ssim"),
+        (("compare", "gold-red-lacquer", "--adapter", "no-such"), "no-such"),
+    ],
+)
+def test_what_fails_in_the_end_fails_at_once(nma, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    for function in ("progressive.render_passes", "measure.measure", "measure.render_seconds"):
+        monkeypatch.setattr(f"nma.render.{function}", None)
+    code, out, err = nma(*words)
+    assert (code, out) == (1, "")
+    assert message in err.splitlines()[-1] and err.splitlines()[-1].startswith("nma: ")
+
+
 def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
     output = tmp_path / "x.npz"
     run = ("simulate", "--draw", 2, "--walks", 1600, "--seed", 5, "-o")

@@ -181,6 +181,7 @@ def compare(
         pictures = {"image": read_image(test), "reference": read_image(reference)}
     else:
         _refuse_unused(context)
+        image_metrics.check_size(_pixels(size))
         view = View(_pixels(size), spp, depth, camera, lighting, envmap, variant)
         pictures = _renderings(read_material(test, changes), view, seed, adapter, clamp)
     truth = pictures.pop("reference")
@@ -216,8 +217,11 @@ def demo(
 
     image_metrics.ensure_libraries()
     files.try_file(output)
+    from nma.adapter import Adapter
     from nma.render import demo as demonstration
 
+    image_metrics.check_size(_pixels(size))
+    Adapter.load(adapter)
     settings = demonstration.Settings(_pixels(size), spp, runs, reference_spp, adapter)
     use_rgb(variant)
     with _samples_bar("demo", demonstration.total_samples(settings)) as advance:
