@@ -12,6 +12,7 @@ from nma import materials
 from nma.errors import NmaError
 from nma.image_io import ImageError, load_bitmap, read_image, write_exr
 from nma.image_size import header_size
+from nma.render.load import load_scene
 from nma.render.scene import preview_scene
 
 FORMATS = ("png", "jpg", "bmp", "tga", "ppm", "hdr", "pfm", "exr")
@@ -80,6 +81,17 @@ def test_textures_and_environment_maps_are_looked_at_too(tmp_path):
         material.values["alpha_top"].read()
     with pytest.raises(NmaError, match="bomb.hdr claims"):
         preview_scene({"type": "diffuse"}, envmap=bomb(tmp_path / "bomb.hdr", "hdr"))
+
+
+def test_scene_files_that_name_such_an_image_are_refused(tmp_path):
+    (tmp_path / "textures").mkdir()
+    bomb(tmp_path / "textures" / "bomb.png", "png")
+    texture = '<texture type="bitmap"><string name="filename" value="textures/bomb.png"/></texture>'
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><bsdf type="diffuse">{texture}</bsdf></scene>'
+    )
+    with pytest.raises(NmaError, match="bomb.png claims"):
+        load_scene(tmp_path / "scene.xml")
 
 
 @pytest.mark.parametrize(

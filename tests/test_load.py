@@ -40,6 +40,20 @@ def test_passes_average_to_one_picture_and_equal_seeds_repeat_it(monkeypatch):
     assert (image != other).all(axis=2).mean() > 0.9
 
 
+def test_errors_of_mitsuba_while_it_renders_are_one_line(monkeypatch):
+    def fails(*args, **kwargs):
+        raise RuntimeError("[integrator.cpp:12] this scene\nis beyond me")
+
+    monkeypatch.setattr(mi, "render", fails)
+    with pytest.raises(SceneError, match="cannot render the scene: this scene is beyond me"):
+        render_passes(load_dict(EMPTY | {"integrator": {"type": "path"}}), 1)
+
+
+def test_a_scene_without_an_integrator_is_not_rendered():
+    with pytest.raises(SceneError, match="no integrator; add one"):
+        render_passes(load_dict(EMPTY), 1)
+
+
 def test_no_samples_are_refused():
     with pytest.raises(ParamError, match="at least 1"):
         render_passes(load_dict(EMPTY), 0)
@@ -72,6 +86,7 @@ def test_a_scene_file_may_use_material_files_beside_it(tmp_path):
         ("<scene", "Parsing"),
         ('<bsdf version="3.0.0" type="diffuse"/>', "no scene"),
         ('<scene version="3.0.0"><bsdf type="velvet"/></scene>', "velvet"),
+        ('<scene version="3.0.0"><integrator type="path"/></scene>', "no sensor"),
     ],
 )
 def test_faulty_scene_files_are_refused(tmp_path, text, message):

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from nma.errors import NmaError, ParamError, one_line
+from nma.image_io import check_size
 from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.scene import bitmap_texture
+
+# How the names of images end that Mitsuba reads.
+_IMAGES = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 
 MODELS = ("nma", "layered")
 
@@ -61,11 +66,13 @@ def load_scene(
 
     Raises:
         SceneError: there is no such file, or Mitsuba cannot load it.
+        ImageError: an image of absurd size.
     """
     import mitsuba as mi
 
     if not os.path.isfile(path):
         raise SceneError(f"there is no scene file {path}")
+    _check_images(Path(path))
     try:
         scene = mi.load_file(str(path), **dict(define or {}))  # type: ignore[arg-type]
     except RuntimeError as error:
@@ -79,6 +86,14 @@ def load_scene(
         film["size"] = size
         film.update()
     return scene
+
+
+def _check_images(path: Path) -> None:
+    """Refuses images of absurd size that the file names, before Mitsuba takes memory for their pixels."""
+    for name in re.findall(rb'value\s*=\s*"([^"]+)"', path.read_bytes()):
+        image = path.parent / os.fsdecode(name)
+        if image.suffix.lower() in _IMAGES and image.is_file():
+            check_size(image)
 
 
 def _value(value: float | tuple[float, ...] | Texture) -> Any:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.errors import ParamError
+from nma.errors import ParamError, one_line
 from nma.image_size import MOST_PIXELS
+from nma.render.load import SceneError
 
 # Samples of one pass over the whole picture: a second or so on two cores, and a bound on memory.
 SAMPLES_PER_PASS = 1 << 20
@@ -37,18 +38,24 @@ def render_passes(
 
     Raises:
         ParamError: spp below 1, or more pixels than `MOST_PIXELS`.
+        SceneError: there is no integrator, or Mitsuba fails; the message says why.
     """
     import mitsuba as mi
 
     if spp < 1:
         raise ParamError(f"{spp} samples per pixel; take at least 1")
+    if integrator is None and scene.integrator() is None:
+        raise SceneError('the scene has no integrator; add one, <integrator type="path"/> for example')
     width, height = map(int, scene.sensors()[sensor].film().crop_size())
     check_size((width, height))
     passes = pass_sizes(spp, width * height)
     total = np.zeros(())
     for number, samples in enumerate(passes):
         options: Any = {"sensor": sensor, "integrator": integrator, "seed": _pass_seed(seed, number)}
-        image = mi.render(scene, spp=samples, **options)
+        try:
+            image = mi.render(scene, spp=samples, **options)
+        except RuntimeError as error:
+            raise SceneError(f"Mitsuba cannot render the scene: {one_line(str(error))}") from error
         total = total + samples * np.array(image, dtype=np.float64)
         progress(samples)
     return (total / spp).astype(np.float32)
