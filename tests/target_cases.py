@@ -5,6 +5,14 @@ import numpy as np
 from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 
+# Of `jax.jit`, where compiling takes longest: XLA fuses the target into kernels that are slow to make.
+FAST_COMPILE = {
+    "compiler_options": {
+        "xla_disable_hlo_passes": "fusion,cpu-instruction-fusion",
+        "xla_llvm_disable_expensive_passes": True,
+    }
+}
+
 
 def random_principled(
     rng: np.random.Generator, n: int, dialect: bool = True, fades: bool = False

@@ -15,6 +15,7 @@ pytest.importorskip("optax", reason="training needs optax, the extra [train]", e
 
 import jax
 import jax.numpy as jnp
+from target_cases import FAST_COMPILE
 from training_cases import (
     BRASS,
     FALSE_ALARM,
@@ -160,7 +161,7 @@ def test_albedos_and_their_derivatives_are_unbiased(tables):
         return halves.mean(axis=(0, 2)), (halves[0] * halves[1]).mean(axis=1)
 
     def each(function):
-        return jax.jit(jax.vmap(function, in_axes=(None, None, 0)))
+        return jax.jit(jax.vmap(function, in_axes=(None, None, 0)), **FAST_COMPILE)
 
     estimates, derivatives = each(estimate), each(jax.jacrev(lambda *x: estimate(*x)[0]))
     angles, step = (0.1, 0.5, 0.98), 1e-4

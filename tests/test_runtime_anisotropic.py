@@ -154,9 +154,11 @@ def test_cosines_and_other_shapes_are_refused(case):
             call(none(), wi[1:])
 
 
-def test_there_are_no_curves(case, compiler, tmp_path):
-    """In C++ with a reason, in C with a null."""
-    source = tmp_path / "curves.cpp"
+@pytest.fixture(scope="module")
+def curves(compiler, tmp_path_factory):
+    """A program that says why it cannot make curves of an adapter."""
+    folder = tmp_path_factory.mktemp("curves")
+    source = folder / "curves.cpp"
     source.write_text(
         """
         #include "nma.h"
@@ -171,9 +173,14 @@ def test_there_are_no_curves(case, compiler, tmp_path):
         }
         """
     )
-    command = [compiler, "-std=c++17", f"-I{RUNTIME}", source, "-o", tmp_path / "curves"]
-    subprocess.run(command, check=True)
-    done = subprocess.run([tmp_path / "curves", case[1]], capture_output=True, text=True, check=True)
+    program = folder / "curves"
+    subprocess.run([compiler, "-std=c++17", f"-I{RUNTIME}", source, "-o", program], check=True)
+    return program
+
+
+def test_there_are_no_curves(case, curves):
+    """In C++ with a reason, in C with a null."""
+    done = subprocess.run([curves, case[1]], capture_output=True, text=True, check=True)
     assert "anisotropic" in done.stdout and "prepare by direction" in done.stdout
     runtime = Runtime(case[1])
     runtime._library.nma_curves_new.restype = ctypes.c_void_p

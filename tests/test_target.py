@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from target_cases import mapped, random_blend, random_directions, random_principled, stacked
+from target_cases import FAST_COMPILE, mapped, random_blend, random_directions, random_principled, stacked
 
 from nma import ops, target
 from nma.llvm import ensure_llvm
@@ -19,9 +19,6 @@ ensure_llvm()
 import mitsuba as mi  # noqa: E402  (libLLVM comes first)
 
 SINGLE_EPS = 2.0**-24
-FAST_COMPILE = {
-    "compiler_options": {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-}
 
 
 def to_single(tree):

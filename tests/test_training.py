@@ -15,6 +15,7 @@ pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_t
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
 
 import jax
+from target_cases import FAST_COMPILE
 from training_cases import BRASS, TINY, batch_of, constant_adapter, lambertian, means_of
 
 from nma import network, target
@@ -28,6 +29,15 @@ from nma.train.data import BinSampler, Pool, draw
 from nma.train.recipe import CLASS, PAPER, SINGLE, Recipe, preset
 
 QUICK = replace(SINGLE, network="1x16", rows=32, bins_per_row=8, points=32, steps=300, learning_rate=2e-2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fast_compile():
+    """Runs here are so short that compiling takes longest."""
+    with pytest.MonkeyPatch.context() as patch:
+        steps = jax.jit(loop._group.__wrapped__, static_argnames=("recipe", "objective"), **FAST_COMPILE)
+        patch.setattr(loop, "_group", steps)
+        yield
 
 
 @pytest.fixture(scope="module")
