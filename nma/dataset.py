@@ -116,9 +116,11 @@ class Dataset:
             settings = Settings(**dict(table.attrs["nma_dataset"]))  # type: ignore[arg-type]
             fingerprint = table.attrs["nma_params"]
         except Exception as e:
-            raise DatasetError(
-                f"{path} is not a dataset of tables ({e}); `nma dataset CLASS {path}` makes one"
-            ) from None
+            advice = f"`nma dataset CLASS {path}` makes one"
+            if os.path.exists(path / "zarr.json"):
+                advice = f"choose another folder or, if it is a damaged dataset, delete it: {advice} anew"
+            reason = str(e).partition("\n")[0] or type(e).__name__
+            raise DatasetError(f"{path} is not a dataset of tables ({reason}); {advice}") from None
         if settings.format != FORMAT:
             raise DatasetError(
                 f"{path} has format {settings.format}, this version reads {FORMAT}; generate it again"

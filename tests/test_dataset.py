@@ -236,6 +236,15 @@ def test_a_material_beyond_the_last_is_refused(whole):
             whole.load([index])
 
 
+def test_a_dataset_without_a_sound_description_is_refused_with_advice(copy):
+    (copy.path / "zarr.json").write_text('{"shape": [\n')
+    with pytest.raises(
+        DatasetError, match="is not a dataset.*damaged.*delete it.*`nma dataset CLASS"
+    ) as caught:
+        Dataset.create(copy.path, SETTINGS)
+    assert "\n" not in str(caught.value)
+
+
 def test_what_is_no_dataset_is_refused(tmp_path):
     (tmp_path / "file").write_text("no folder")
     for path in (tmp_path / "nowhere", tmp_path, tmp_path / "file"):

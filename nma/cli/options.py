@@ -9,7 +9,14 @@ import typer
 
 def number(help: str, low: float, high: float, **more: Any) -> Any:
     """A number between two bounds, both included; NaN lies outside."""
-    return typer.Option(min=low, max=high, help=help, **more)
+    return typer.Option(min=low, max=high, help=help, callback=_no_nan, **more)
+
+
+def _no_nan(value: float | None) -> float | None:
+    """Which no bounds of typer's keep out, in some of its versions."""
+    if value is not None and value != value:
+        raise typer.BadParameter("NaN is no number between the bounds")
+    return value
 
 
 def walks(help: str) -> Any:
