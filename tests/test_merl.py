@@ -1,17 +1,24 @@
 """MERL files: their layout, how they are looked up, and how they are written from other sources."""
 
 import math
+import re
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from adapter_cases import random_adapter
 from source_cases import LAMBERT, Formula, direction, lanes, numbers, pairs
 
-from nma import ops
+from nma import materials, ops
+from nma.adapter import Adapter
 from nma.errors import SourceError
 from nma.ops import Vec3
 from nma.sources import half_difference, merl, read
+from nma.sources.adapter import AdapterValues
 from nma.sources.merl import BYTES, SCALE, SHAPE, Merl
+from nma.sources.nbrdf import WEIGHTS
+from nma.table import Tables
 
 
 def at(h, d, p):
@@ -241,3 +248,73 @@ def test_near_the_mirror_direction_steps_are_fine():
     wi, wo = direction(mu, np.zeros(400)), direction(np.cos(theta), np.full(400, math.pi))
     found, expected = numbers(source.eval(wi, wo)), numbers(narrow.eval(wi, wo))
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
+
+
+# ---- The command -----------------------------------------------------------------------------------------------------
+
+LACQUER = materials.load("gold-red-lacquer")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A BSDF, an adapter of the class and one of a single material, networks, and a table."""
+    folder = tmp_path_factory.mktemp("sources")
+    (folder / "matte.xml").write_text('<bsdf version="3.0.0" type="diffuse"/>')
+    (folder / "brushed.xml").write_text(
+        '<bsdf version="3.0.0" type="principled"><float name="anisotropic" value=".9"/></bsdf>'
+    )
+    random_adapter(hidden="1x8").save(folder / "class.safetensors")
+    single = random_adapter(hidden="1x8", name="direction")
+    record = {"params": LACQUER.vector().tolist()}
+    replace(single, training=record).save(folder / "single.safetensors")
+    np.savez(folder / "networks.npz", names=np.array(["a"]), weights=np.zeros((1, WEIGHTS), np.float32))
+    Tables(np.zeros((1, 0)), np.zeros((1, 2, 2, 2, 3)), np.ones(1, np.int64)).save(folder / "table.npz")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "values"),
+    [
+        (["matte.xml"], lambda: read("matte.xml")),
+        (["networks.npz", "--material", "a"], lambda: read("networks.npz", "a")),
+        (["single.safetensors"], lambda: AdapterValues(Adapter.load("single.safetensors"))),
+        (
+            ["gold-red-lacquer", "--adapter", "class.safetensors"],
+            lambda: AdapterValues(Adapter.load("class.safetensors"), LACQUER.vector()),
+        ),
+    ],
+)
+def test_any_isotropic_material_is_written_by_a_command(
+    nma, folder, tmp_path, monkeypatch, arguments, values
+):
+    monkeypatch.chdir(folder)
+    path = tmp_path / "new" / "it.binary"
+    code, out, err = nma("data", "merl", *arguments, "-o", path)
+    assert (code, out) == (0, ""), err
+    assert "75% of the entries above the horizon" in err
+    np.testing.assert_array_equal(merl.read(path), Merl.of(values()).planes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["brushed.xml"], "this one is anisotropic"),
+        (["table.npz"], "holds tables.*nma fit table.npz"),
+        (["none.npz"], "no such file"),
+        (["class.safetensors"], "class: an adapter of the whole class layered3; name a material"),
+        (["gold-red-laquer"], "did you mean 'gold-red-lacquer'"),
+        (["wet-nickel", "--adapter", "single.safetensors"], "knows a single material"),
+    ],
+)
+def test_what_has_no_values_for_a_merl_file_is_one_line(
+    nma, folder, tmp_path, monkeypatch, arguments, message
+):
+    monkeypatch.chdir(folder)
+    code, out, err = nma("data", "merl", *arguments, "-o", tmp_path / "it.binary")
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1 and re.search(message, err), err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_merl_file_has_the_ending_of_one(nma, tmp_path):
+    assert nma("data", "merl", "gold-red-lacquer", "-o", tmp_path / "it.bin")[0] == 2

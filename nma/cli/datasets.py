@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
+from nma import files
 from nma.cli import console
 
 data = typer.Typer(
     invoke_without_command=True,
-    help="List the data sets of measured materials that sources read: origin, terms, files. Nothing is downloaded.",
+    help="List the data sets of measured materials that sources read: origin, terms, files. Nothing is downloaded. "
+    "[bold]check[/bold] looks at copies of them, [bold]merl[/bold] writes any isotropic material in MERL's format.",
 )
 
 
@@ -51,3 +53,48 @@ def check(path: Annotated[Path, typer.Argument(help="A file, or a folder that ho
         console.tell(line)
     if not all(f.ok for f in findings):
         raise typer.Exit(1)
+
+
+@data.command()
+def merl(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="A file of values (.bsdf, .xml, .binary, NBRDF's .npz), the adapter of a single material "
+            "(.safetensors), or a named material or material file (.toml), which --adapter evaluates."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The file (.binary) to write.")],
+    material: Annotated[str | None, typer.Option(help="Which network of an NBRDF file.")] = None,
+    adapter: Annotated[
+        str,
+        typer.Option(
+            help="A shipped adapter's name or a weights file, for named materials and material files."
+        ),
+    ] = "layered3-5x64",
+    clamp: Annotated[
+        bool,
+        typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range."),
+    ] = False,
+) -> None:
+    """Write any isotropic material as a MERL file: 90 x 90 x 180 values at half and difference angles.
+
+    Example: [bold]nma data merl gold-red-lacquer -o gold.binary[/bold]
+    """
+    if output.suffix != ".binary":
+        raise typer.BadParameter(f"output {output} must end in .binary")
+    files.try_file(output)
+    from nma.cli.material import values_of
+    from nma.sources.merl import SCALE, Merl
+
+    values = values_of(source, material, adapter, clamp)
+    written = Merl.of(values)
+    written.save(output)
+    seen = (written.planes >= 0).all(axis=0)
+    share, brightest = seen.mean(), (written.planes[:, seen] * SCALE[:, None]).max()
+    console.err.print(
+        f"{output}: {values.name}, {share:.0%} of the entries above the horizon, f up to {brightest:.4g} 1/sr",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )

@@ -61,6 +61,29 @@ def tables_of(
     return tables, {**record, "points_per_bin": POINTS}
 
 
+def values_of(source: str, material: str | None, adapter: str, clamp: bool = False) -> Values:
+    """What has a value at any pair of directions: a file of values, the adapter of a single material (.safetensors), or
+    a named material or material file as `adapter` shows it, whose parameters `clamp` moves to its training range.
+
+    Raises `NmaError` for what cannot be read, and for tables, which hold means over bins.
+    """
+    from nma import materials
+    from nma.adapter import Adapter
+    from nma.sources.adapter import AdapterValues
+
+    path = Path(source)
+    if path.suffix == ".npz" and _is_reference(path):
+        raise TableError(
+            f"{path}: holds tables, whose bins are too wide; fit it first: nma fit {path} -o X.safetensors"
+        )
+    if path.suffix == ".safetensors":
+        return AdapterValues(Adapter.load(path), name=path.stem)
+    if path.suffix in ("", ".toml") or source in materials.names():
+        known, network = materials.load(source), Adapter.load(adapter)
+        return AdapterValues(network, network.check(known.vector(), clamp)[0], known.name)
+    return _values(path, material)[0]
+
+
 def _simulated(name: str, walks: int, seed: int) -> tuple[Tables, dict[str, Any]]:
     from nma import materials, sources
     from nma.table import stream_keys, tabulate
@@ -106,6 +129,10 @@ def _number(path: Path, count: int, material: str | None) -> int:
             f"{path}: holds {count} material(s); choose one with --material 0 .. {count - 1}{given}"
         )
     return int(material)
+
+
+def _is_reference(path: Path) -> bool:
+    return path.is_file() and _holds_tables(path)
 
 
 def _holds_tables(path: Path) -> bool:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from nma import target
 from nma.adapter import Adapter
+from nma.errors import ParamError
 from nma.ops import Color, Vec3
 from nma.target import Plane
 
@@ -20,7 +21,11 @@ class AdapterValues:
     def __init__(self, adapter: Adapter, params: ArrayLike = (), name: str = "adapter"):
         self.adapter, self.name = adapter, name
         given = np.asarray(params, np.float64)
-        if not given.size and adapter.material is not None:
+        if not given.size and adapter.space.size:
+            if adapter.material is None:
+                raise ParamError(
+                    f"{name}: an adapter of the whole class {adapter.space.name}; name a material, too"
+                )
             given = adapter.material
         self.params = adapter.check(given[None])[0].tolist()
         self.isotropic = not adapter.anisotropic
