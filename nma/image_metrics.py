@@ -150,7 +150,7 @@ def _library(name: str) -> Any:
         return import_module(name)
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            f"comparing images needs {error.name}; run: pip install 'neural-material-adapter[compare]'"
+            f"comparing images needs {error.name}; in a checkout of this project run: pip install '.[compare]'"
         ) from error
 
 

@@ -91,7 +91,9 @@ def test_too_small_images_are_refused_for_ssim():
 
 def test_missing_library_names_the_extra(picture, monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(MissingDependencyError, match=r"neural-material-adapter\[compare\]"):
+    with pytest.raises(
+        MissingDependencyError, match=r"in a checkout of this project run: pip install '\.\[compare\]'"
+    ):
         flip_map(picture, picture)
 
 

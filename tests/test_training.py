@@ -235,5 +235,5 @@ def test_without_jax_or_optax_the_user_learns_what_to_install(missing, tmp_path)
     )
     assert result.returncode == 1
     assert result.stderr.startswith(f"nma: training needs JAX and optax ({missing} is missing)")
-    assert result.stderr.rstrip().endswith("pip install 'neural-material-adapter[train]'")
+    assert result.stderr.rstrip().endswith("in a checkout of this project run: pip install '.[train]'")
     assert result.stderr.count("\n") == 1

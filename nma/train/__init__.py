@@ -1,4 +1,4 @@
-"""Training of adapters with JAX, an optional extra: `pip install neural-material-adapter[train]`."""
+"""Training of adapters with JAX, an optional extra: in a checkout, `pip install '.[train]'`."""
 
 from nma.errors import MissingDependencyError
 
@@ -8,5 +8,5 @@ try:
 except ImportError as e:
     raise MissingDependencyError(
         f"training needs JAX and optax ({e.name} is missing); "
-        "install them with: pip install 'neural-material-adapter[train]'"
+        "in a checkout of this project run: pip install '.[train]'"
     ) from None
