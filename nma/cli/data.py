@@ -75,10 +75,7 @@ def simulate(
     ] = None,
     draw: Annotated[int, options.number("Draw this many materials at random instead.", 0, 100_000)] = 0,
     population: Annotated[
-        str,
-        typer.Option(
-            help="Where drawn conductors come from: mixed, range, metals, held_out_metals, unseen_metals."
-        ),
+        str, options.choice("Where drawn conductors come from.", *options.POPULATIONS)
     ] = "mixed",
     class_name: Annotated[
         str, typer.Option("--class", help="The class of the source materials.")
@@ -126,7 +123,9 @@ def dataset(
     materials: Annotated[int, options.number("Number of materials.", 1, 10**6)] = 8000,
     walks: Annotated[int, options.walks("Random walks per material.")] = 819_200,
     seed: Annotated[int, options.seed("Equal seeds give equal datasets.")] = 0,
-    population: Annotated[str, typer.Option(help="mixed, range, metals or held_out_metals.")] = "mixed",
+    population: Annotated[
+        str, options.choice("Where conductors come from.", *options.POPULATIONS[:-1])
+    ] = "mixed",
 ) -> None:
     """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
     from nma.dataset import Dataset, Settings

@@ -19,20 +19,24 @@ from nma.params import LAYERED3
 _Seed = Annotated[int, options.seed("Seed of the weights, of the batches and of a simulated table.")]
 _Points = Annotated[int | None, options.number("Points per bin of the AvA estimate (eq. 6).", 1, 4096)]
 _PointsLaw = Annotated[
-    str | None, typer.Option(help="crowded, uniform (the paper), or centre (point supervision).")
+    str | None,
+    options.choice(
+        "Where points lie: centre is point supervision, uniform the paper's.", *options.POINTS_LAWS
+    ),
 ]
 _Target = Annotated[
     str | None,
-    typer.Option(
-        help="principled (the paper's 11 numbers), stretched (lobes stretch along the plane of incidence), "
-        "measured (and fade out), or anisotropic (the same along the surface's axes)."
+    options.choice(
+        "The first has the paper's 11 numbers, the second stretches lobes along the plane of incidence, the third "
+        "lets them fade out, too, the last does the same along the surface's axes.",
+        *options.TARGETS,
     ),
 ]
 _Albedo = Annotated[
     float | None, options.number("Weight of the error of the directional albedo; 0: none.", 0, 1e6)
 ]
 _Finest = Annotated[float | None, options.number("Microfacet width down to which points crowd.", 1e-6, 1)]
-_Loss = Annotated[str | None, typer.Option(help="huber, or log (the paper's eq. 7).")]
+_Loss = Annotated[str | None, options.choice("log is the paper's eq. 7.", *options.LOSSES)]
 
 
 def register(app: typer.Typer) -> None:
@@ -57,10 +61,10 @@ def train(
     refresh: Annotated[
         int, options.number("Steps between two exchanges of streamed materials.", 1, 10**9)
     ] = 400,
-    preset: Annotated[str, typer.Option(help="class, or paper for the paper's recipe.")] = "class",
-    variant: Annotated[
-        str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
-    ] = "blended+omega_i",
+    preset: Annotated[
+        str, options.choice("Our recipe for classes, or the paper's.", "class", "paper")
+    ] = "class",
+    variant: options.Variant = "blended+omega_i",
     instances: Annotated[
         int | None, options.number("Principled instances in the blend, instead of the variant's.", 1, 5)
     ] = None,
@@ -85,9 +89,7 @@ def train(
 
     checkpoint = output.with_name(output.name + ".ckpt")
     files.try_file(output, checkpoint, console.loss_plot(output))
-    if preset not in ("class", "paper"):
-        raise typer.BadParameter(f"preset must be class or paper, got '{preset}'")
-    lobes, directional = _variant(variant)
+    lobes, directional = options.VARIANTS[variant]
     recipe = recipes.preset(
         preset,
         network=network,
@@ -129,9 +131,7 @@ def fit(
         ),
     ] = None,
     walks: Annotated[int, options.walks("Walks of the table of a simulated material.")] = 64_000_000,
-    variant: Annotated[
-        str, typer.Option(help="blended+omega_i, blended, omega_i, or single.")
-    ] = "blended+omega_i",
+    variant: options.Variant = "blended+omega_i",
     network: options.Network = None,
     target: _Target = None,
     steps: options.Steps = None,
@@ -156,7 +156,7 @@ def fit(
 
     files.try_file(output, console.loss_plot(output))
     known, record = read(source, material, walks, seed)
-    lobes, directional = _variant(variant)
+    lobes, directional = options.VARIANTS[variant]
     recipe = recipe_for(
         known,
         network=network,
@@ -246,19 +246,6 @@ def _compare(adapter, source) -> None:
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
     """The figures for JSON, which has no infinity: the PSNR of equal tables becomes null."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}
-
-
-def _variant(name: str) -> tuple[int, bool]:
-    """(instances, whether parameters vary with wi) of the paper's four variants."""
-    variants = {
-        "blended+omega_i": (2, True),
-        "blended": (2, False),
-        "omega_i": (1, True),
-        "single": (1, False),
-    }
-    if name not in variants:
-        raise typer.BadParameter(f"variant must be one of {', '.join(variants)}, got '{name}'")
-    return variants[name]
 
 
 def _target(directional: bool) -> str | None:

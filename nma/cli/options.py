@@ -36,9 +36,29 @@ def exposure(help: str) -> Any:
     return number(help, -32, 32)
 
 
+def choice(help: str, *values: str) -> Any:
+    """One of some words."""
+
+    def check(value: str | None) -> str | None:
+        if value is not None and value not in values:
+            raise typer.BadParameter(f"'{value}' is not one of {', '.join(values)}")
+        return value
+
+    return typer.Option(help=f"{', '.join(values)}. {help}", callback=check)
+
+
 _STEPS = number("Number of optimisation steps.", 1, 10**9)
 _RATE = number("Learning rate of Adam, its peak under the one-cycle schedule.", 1e-9, 10)
 
 Steps = Annotated[int | None, _STEPS]
 Rate = Annotated[float | None, _RATE]
+# As `nma.train.recipe.Recipe` and `nma.params` declare them.
+TARGETS = ("principled", "stretched", "measured", "anisotropic")
+POINTS_LAWS = ("crowded", "uniform", "centre")
+LOSSES = ("huber", "log")
+POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
+# Of the paper: how many instances, and whether they follow the view direction.
+VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
+
+Variant = Annotated[str, choice("Whether two instances are blended, and follow the direction.", *VARIANTS)]
 Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.")]
