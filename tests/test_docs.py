@@ -63,7 +63,8 @@ def test_python_of_the_page_on_own_materials_runs(number, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(OWN[number], names)
-    assert names["run"].step == 30
-    assert names["adapter"].space.name == "measured"
+    if "fit(" in OWN[number]:
+        assert names["run"].step == 30
+        assert names["adapter"].space.name == "measured"
     if "image" in names:
         assert np.isfinite(np.array(names["image"])).all() and (tmp_path / "mine.png").is_file()
