@@ -88,6 +88,24 @@ def test_errors_of_the_system_elsewhere_are_one_line(nma, monkeypatch):
     assert nma("mitsuba", "build") == (1, "", "nma: /root/cache: Permission denied\n")
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 74.5 GiB"),
+        RuntimeError("jit_malloc(): out of memory! Could not\nallocate 9 GiB"),
+        RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 123 bytes."),
+    ],
+)
+def test_too_little_memory_is_one_line(nma, monkeypatch, error):
+    def fails():
+        raise error
+
+    monkeypatch.setattr("nma.materials.names", fails)
+    code, out, err = nma("materials")
+    assert (code, out) == (1, "")
+    assert err.startswith("nma: out of memory (") and err.count("\n") == 1
+
+
 @pytest.mark.parametrize("words", [("demo",), ("compare", "gold-red-lacquer"), ("compare", "a.exr", "b.exr")])
 def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)

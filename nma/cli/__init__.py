@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 import nma
 from nma.cli import data, datasets, learn, library, native, principled, system, view
-from nma.errors import NmaError
+from nma.errors import NmaError, one_line
 
 
 class _Commands(TyperGroup):
@@ -73,8 +73,13 @@ def main() -> None:
     except OSError as e:
         _close_stdout()
         _fail(f"{e.filename}: {e.strerror}" if e.filename else str(e))
-    except MemoryError as e:
-        _fail(f"out of memory ({e}); ask for less at a time: fewer pixels, materials or points")
+    except (MemoryError, RuntimeError) as e:
+        # Of Dr.Jit and JAX, it is a RuntimeError that says so.
+        if isinstance(e, RuntimeError) and "out of memory" not in str(e).lower():
+            raise
+        _fail(
+            f"out of memory ({one_line(str(e))}); ask for less at a time: fewer pixels, materials or points"
+        )
     except KeyboardInterrupt:
         _interrupted()
 
