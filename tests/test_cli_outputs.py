@@ -1,9 +1,9 @@
 """Commands try their outputs before they begin, and end in one line where something cannot be written."""
 
 import errno
+import shutil
 import sys
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import pytest
@@ -153,22 +153,16 @@ def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
     assert not parts.exists()
 
 
-def test_parts_that_another_run_takes_away_do_no_harm(tmp_path):
-    """Two runs into one output: the first that ends removes the folder, at any moment of the other."""
-    one = Tables(np.zeros((1, 1)), np.ones((1, 2, 2, 2, 3)), np.ones(1, int))
-    parts = tmp_path / "x.npz.parts"
+def test_parts_that_another_run_takes_away_do_no_harm(nma, tmp_path, monkeypatch):
+    """Two runs into one output: the first that ends removes the folder, while the other is about to name a file."""
+    replace, taken = Path.replace, []
 
-    def tidy():
-        for _ in range(200):
-            for path in parts.glob("*"):
-                path.unlink(missing_ok=True)
-            try:
-                parts.rmdir()
-            except OSError:
-                pass
+    def without_folder(self, target):
+        if not taken:
+            taken.append(shutil.rmtree(tmp_path / "x.npz.parts"))
+        return replace(self, target)
 
-    other = Thread(target=tidy)
-    other.start()
-    made = [table.kept(parts / f"{n}.npz", lambda: one) for n in range(50)]
-    other.join()
-    assert len(made) == 50
+    monkeypatch.setattr(Path, "replace", without_folder)
+    code, _, err = nma("simulate", "--draw", 2, "--walks", 1600, "-o", tmp_path / "x.npz")
+    assert code == 0, err
+    assert taken and [path.name for path in tmp_path.iterdir()] == ["x.npz"]
