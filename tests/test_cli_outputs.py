@@ -53,7 +53,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
             raise OSError(errno.ENOSPC, "No space left on device")
 
         monkeypatch.setattr(Path, "write_bytes", full)
-    ending = {"render": ".png", "principled": ".xml"}.get(words[0], "")
+    ending = {"render": ".png", "principled": ".xml", "merl": ".binary"}.get(words[-1], "")
     code, out, err = nma(*arguments(words, place.format(ending)))
     assert (code, out) == (1, ""), err
     assert err.startswith("nma: ") and err.count("\n") == 1

@@ -92,9 +92,6 @@ def merl(
     written.save(output)
     seen = (written.planes >= 0).all(axis=0)
     share, brightest = seen.mean(), (written.planes[:, seen] * SCALE[:, None]).max()
-    console.err.print(
-        f"{output}: {values.name}, {share:.0%} of the entries above the horizon, f up to {brightest:.4g} 1/sr",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
+    console.say(
+        f"{output}: {values.name}, {share:.0%} of the entries above the horizon, f up to {brightest:.4g} 1/sr"
     )
