@@ -23,6 +23,7 @@ MATERIAL = {
     "albedo": {"type": "rgb", "value": [0.9, 0.3, 0.2]},
     "sigma_t": 0.5,
 }
+CHECKS = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.2, 0.1]}, "color1": 0.3}
 # What every program begins with: its variant and its arguments.
 PRELUDE = """
 import json, sys

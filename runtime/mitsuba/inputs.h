@@ -29,10 +29,11 @@ struct Input {
     Colour value, shown;
     // Of a texture, the channel that a parameter of one number takes; -1 if none was chosen.
     int channel = -1;
-    // Whether the texture shows what it is made of before anything is rendered.
+    // Whether the texture shows all that it is made of before anything is rendered.
     bool known = false;
 
-    bool varies() const { return texture && texture->is_spatially_varying(); }
+    // Mesh attributes do, although Mitsuba's say that they do not.
+    bool varies() const { return texture && (!known || texture->is_spatially_varying()); }
     // Whether it is the same everywhere, but kept by an object that others may share.
     bool lent() const { return texture && !varies(); }
 
@@ -172,9 +173,9 @@ private:
     void settle(Input& input) const {
         const SourceParam& p = input.param;
         if (input.texture) {
-            const std::vector<Texels> found = TexelFinder<Float>(*input.texture).found;
-            input.known = !found.empty();
-            for (const Texels& texels : found) check(input, texels);
+            const TexelFinder<Float> finder(*input.texture);
+            input.known = finder.complete;
+            for (const Texels& texels : finder.found) check(input, texels);
             if (input.lent()) input.value = at(input, dr::zeros<SurfaceInteraction3f>());
             return;
         }

@@ -28,13 +28,17 @@ public:
     explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
 
     std::vector<Texels> found;
+    // Whether each of those textures showed something: others, such as mesh attributes, know their numbers only while rendering.
+    bool complete = true;
 
 protected:
     void put_object(std::string_view, Object* object, uint32_t) override {
         if (!object) return;
+        const std::size_t before = found.size();
         Object* const outer = std::exchange(shown_, object);
         object->traverse(this);
         shown_ = outer;
+        complete &= found.size() > before;
     }
 
     void put_value(std::string_view name, void* value, uint32_t, const std::type_info& type) override {

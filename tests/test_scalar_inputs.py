@@ -1,0 +1,283 @@
+"""Inputs of the plugins compiled for Mitsuba's scalar renderer: what they may be, how they are edited and asked for."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from adapter_cases import random_adapter
+from scalar_cases import CHECKS, MATERIAL, finished, own_cache
+
+from nma.image_io import write_exr, write_png
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with own_cache(tmp_path_factory) as folder:
+        yield folder
+
+
+EDITS = """
+    wo = [0.0, -0.6, 0.8]
+
+    def look(bsdf):
+        return np.array(bsdf.eval(mi.BSDFContext(), interaction(0.7), wo))
+
+    kind, material, pixels = words
+    material = {"type": kind, **material}
+    image = np.array(pixels, np.float32)
+    texture = lambda: {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True}
+"""
+
+
+@pytest.mark.parametrize("kind", ["nma", "layered"])
+def test_edits_are_rendered_at_once_or_refused(kind):
+    """Numbers, colours, pixels; after a refused edit nothing is rendered until it is mended."""
+    finished(
+        EDITS
+        + """
+    bsdf = mi.load_dict(material)
+    params = mi.traverse(bsdf)
+    assert set(params.keys()) == set(material) - {"type"}, params
+    for key, value, other in (("sigma_t", 0.9, {"sigma_t": 0.9}),
+                              ("albedo", [0.2, 0.4, 0.6], {"albedo": {"type": "rgb", "value": [0.2, 0.4, 0.6]}})):
+        params[key] = value
+        params.update()
+        material |= other
+        assert (look(bsdf) == look(mi.load_dict(material))).all(), key
+    before = look(bsdf)
+    for key, bad, good in (("albedo", [0.2, 3.0, 0.6], [0.2, 0.4, 0.6]), ("sigma_t", float("nan"), 0.9)):
+        params[key] = bad
+        assert (look(bsdf) == before).all(), "rendered before it was checked"
+        assert f"{key} is " in refusal(params.update)
+        assert f"{key} is " in refusal(lambda: look(bsdf))
+        params[key] = good
+        params.update()
+        assert (look(bsdf) == before).all(), key
+
+    bsdf = mi.load_dict(material | {"albedo": texture()})
+    params = mi.traverse(bsdf)
+    assert "albedo.data" in params, params
+    params["albedo.data"] = mi.TensorXf(0.5 * np.ones_like(image))
+    params.update()
+    np.testing.assert_allclose(look(bsdf), look(mi.load_dict(material | {"albedo": 0.5})), rtol=0.02)
+    params["albedo.data"] = mi.TensorXf(np.where(image == image[1, 2], 3.0, image))
+    assert "the texture of albedo holds 3 at x=2, y=1" in refusal(params.update)
+    assert "the texture of albedo holds 3" in refusal(lambda: look(bsdf))
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
+                          "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+                          "ball": {"type": "sphere", "center": [0, 0, 3], "bsdf": bsdf}})
+    assert "the texture of albedo holds 3" in refusal(lambda: mi.render(scene, spp=1))
+    params["albedo.data"] = mi.TensorXf(image)
+    params.update()
+    assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
+        """,
+        "scalar_rgb",
+        kind,
+        MATERIAL,
+        np.linspace(0.1, 0.9, 60).reshape(4, 5, 3).tolist(),
+    )
+
+
+@pytest.mark.parametrize("kind", ["nma", "layered"])
+def test_edits_of_shared_textures_are_seen(kind):
+    """Mitsuba does not tell the second of two owners."""
+    finished(
+        EDITS
+        + """
+    shared = {"type": "ref", "id": "shared"}
+    for about, leaf, bad in (({"type": "srgb", "color": [0.1, 0.5, 0.9]}, ".value", mi.Color3f(3.0)),
+                             (texture(), ".data", mi.TensorXf(3 * np.ones_like(image)))):
+        scene = mi.load_dict({"type": "scene", "shared": about,
+                              "far": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": shared}},
+                              "ball": {"type": "sphere", "bsdf": material | {"albedo": shared}}})
+        bsdf = scene.shapes()[1].bsdf()
+        assert "albedo" in str(bsdf)
+        params = mi.traverse(scene)
+        key, = (k for k in params.keys() if k.endswith(leaf))
+        params[key] = mi.Color3f(0.3) if leaf == ".value" else mi.TensorXf(0.3 * np.ones_like(image))
+        params.update()
+        np.testing.assert_allclose(look(bsdf), look(mi.load_dict(material | {"albedo": 0.3})), rtol=0.02)
+        params[key] = bad
+        try:
+            params.update()
+        except RuntimeError:
+            pass
+        assert "the texture of albedo holds 3, allowed is 0 .. 1" in refusal(lambda: look(bsdf))
+        """,
+        "scalar_rgb",
+        kind,
+        MATERIAL,
+        np.linspace(0.1, 0.9, 60).reshape(4, 5, 3).tolist(),
+    )
+
+
+@pytest.mark.parametrize("kind", ["nma", "layered"])
+def test_attributes_and_channels_of_inputs(kind):
+    finished(
+        EDITS
+        + """
+    packed = mi.load_dict(material | {"sigma_t": texture(), "sigma_t_channel": "g", "albedo": texture()})
+    si = interaction(0.7)
+    si.uv = [2.5 / 5, 1.5 / 4]
+    pixel = image[1, 2]
+    assert packed.has_attribute("sigma_t") and not packed.has_attribute("roughness")
+    for name, wanted in (("sigma_t", [pixel[1]] * 3), ("albedo", pixel), ("alpha_top", [material["alpha_top"]] * 3)):
+        for found in (packed.eval_attribute(name, si), packed.eval_attribute_3(name, si)):
+            np.testing.assert_allclose(np.array(found), wanted, rtol=1e-5)
+        np.testing.assert_allclose(packed.eval_attribute_1(name, si), np.mean(wanted), rtol=1e-5)
+    assert "Invalid attribute requested roughness" in refusal(lambda: packed.eval_attribute("roughness", si))
+    grey = material | {"sigma_t": float(pixel[1]), "albedo": {"type": "rgb", "value": [float(c) for c in pixel]}}
+    grey = mi.load_dict(grey | ({"online": True} if kind == "nma" else {}))
+    look = lambda bsdf: np.array(bsdf.eval(mi.BSDFContext(), si, wo))
+    np.testing.assert_allclose(look(packed), look(grey), rtol=1e-4)
+        """,
+        "scalar_rgb",
+        kind,
+        MATERIAL,
+        np.linspace(0.1, 0.9, 60).reshape(4, 5, 3).tolist(),
+    )
+
+
+PLATE = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property float r
+property float g
+property float b
+element face 1
+property list uchar int vertex_index
+end_header
+-9 -9 0 3 3 3
+9 -9 0 3 3 3
+0 9 0 3 3 3
+3 0 1 2
+"""
+
+
+@pytest.mark.parametrize("kind", ["nma", "layered"])
+def test_what_only_a_mesh_knows_is_moved_into_the_range(kind, tmp_path):
+    """Beside a constant, too, which is known when the scene is loaded."""
+    (tmp_path / "plate.ply").write_text(PLATE)
+    colours = {"type": "mesh_attribute", "name": "vertex_color"}
+    finished(
+        """
+    path, *bsdfs = words
+    pictures = []
+    for bsdf in bsdfs:
+        look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+        film = {"type": "hdrfilm", "width": 4, "height": 4}
+        scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, "sky": {"type": "constant"},
+                              "sensor": {"type": "perspective", "fov": 10, "to_world": look, "film": film},
+                              "plate": {"type": "ply", "filename": path, "bsdf": bsdf}})
+        pictures.append(np.array(mi.render(scene, spp=64, seed=1)))
+    assert pictures[0].max() > 0
+    np.testing.assert_allclose(pictures[0], pictures[1], rtol=1e-3)
+    np.testing.assert_allclose(pictures[0], pictures[2], rtol=1e-3)
+        """,
+        "scalar_rgb",
+        str(tmp_path / "plate.ply"),
+        *(
+            {"type": kind, **MATERIAL, "albedo": albedo} | ({"online": True} if kind == "nma" else {})
+            for albedo in (1.0, colours, {"type": "checkerboard", "color0": colours, "color1": colours})
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def bitmap(tmp_path_factory):
+    """Textures of ones by the value of their pixel at x=1, y=2."""
+    folder = tmp_path_factory.mktemp("textures")
+
+    def made(pixel):
+        image = np.ones((4, 3, 3))
+        image[2, 1] = pixel
+        path = write_exr(folder / f"{len(list(folder.iterdir()))}.exr", image)
+        return {"type": "bitmap", "filename": str(path), "raw": True}
+
+    return made
+
+
+def png(folder, raw):
+    path = folder / f"{raw}.png"
+    write_png(path, np.full((2, 2, 3), 128, np.uint8))
+    return {"type": "bitmap", "filename": str(path), "raw": raw}
+
+
+COLOUR = {"type": "rgb", "value": [0.1, 0.5, 0.9]}
+
+
+def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
+    """Numbers of sRGB 128: .2158605 (IEC 61966-2-1), 128 / 255 where the texture is `raw`."""
+    one = str(tmp_path / "one.safetensors")
+    known = [
+        x for value in MATERIAL.values() for x in (value["value"] if isinstance(value, dict) else [value])
+    ]
+    adapter = random_adapter(hidden="1x8", name="direction")
+    dataclasses.replace(adapter, training={"params": known}).save(one)
+    coloured, shared = bitmap([0.1, 0.2, 0.3]), {"type": "srgb", "color": [0.1, 0.5, 0.9]}
+    cases = [
+        ({"sigma_t": 7.0}, "sigma_t is 7, allowed is 0 .. 1, the range"),
+        ({"precision": "half"}, "precision is float32, compact or bfloat16, not 'half'"),
+        ({"adapter": "none"}, "none: no such weights file"),
+        ({"albedo": None}, "no value for albedo"),
+        ({"material": "wet-nickel"}, "`material` is known in vectorised variants only"),
+        (
+            {"sigma_t": bitmap(7.0)},
+            "sigma_t holds 7 at x=1, y=2, one of 3 such values of 36; allowed is 0 .. 1",
+        ),
+        ({"sigma_t": bitmap(math.nan), "clamp": True}, "the texture of sigma_t holds nan at x=1, y=2"),
+        ({"sigma_t": coloured}, "the texture of sigma_t is coloured, and sigma_t is one number per pixel"),
+        ({"sigma_t": coloured}, "choose a channel: set `sigma_t_channel` to r, g or b"),
+        ({"sigma_t": coloured, "sigma_t_channel": "g"}, None),
+        ({"sigma_t": bitmap([7, 0.5, 0]), "sigma_t_channel": "g"}, None),
+        (
+            {"sigma_t": bitmap([0, 7, 0]), "sigma_t_channel": "g"},
+            "holds 7 at x=1, y=2, one of 1 such values of 12",
+        ),
+        ({"sigma_t": coloured, "sigma_t_channel": "a"}, "sigma_t_channel is 'a'; take r, g or b"),
+        ({"sigma_t_channel": "g"}, "sigma_t_channel chooses a channel of a texture"),
+        ({"albedo_channel": "g"}, "albedo_channel chooses a channel of a texture"),
+        ({"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo holds 1.5, one of 1"),
+        ({"sigma_t": COLOUR}, "sigma_t wants one number or a texture, got the colour 0.1, 0.5, 0.9"),
+        ({"sigma_t": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}, None),
+        ({"sigma_t": shared}, "the texture of sigma_t is coloured"),
+        ({"sigma_t": shared, "sigma_t_channel": "b"}, None),
+        ({"sigma_t": bitmap(7.0), "clamp": True}, None),
+        (
+            {"sigma_t": bitmap(-1.0), "type": "layered"},
+            "the texture of sigma_t holds -1 at x=1, y=2, one of 3",
+        ),
+        ({"sigma_t": bitmap(7.0), "type": "layered"}, None),
+        ({"adapter": one, "sigma_t": 0.5}, None),
+        ({"adapter": one, **dict.fromkeys(MATERIAL)}, None),
+        ({"adapter": one, "sigma_t": 0.6}, "knows a single material, whose sigma_t is 0.5, not 0.6"),
+        ({"adapter": one, "sigma_t": bitmap(0.5)}, "so that no texture can drive sigma_t"),
+        ({"eta_top": png(tmp_path, False)}, "the texture of eta_top holds 0.21586 at x=0, y=0"),
+        ({"eta_top": png(tmp_path, True)}, "the texture of eta_top holds 0.501961"),
+        (
+            {"eta_top": png(tmp_path, True)},
+            'its pixels are bytes, 0 to 1; with `format` "variant" a bitmap keeps',
+        ),
+    ]
+    bsdfs = [
+        {k: v for k, v in {"type": "nma", **MATERIAL, **change}.items() if v is not None}
+        for change, _ in cases
+    ]
+    said = finished(
+        """
+        for bsdf in words:
+            try:
+                mi.load_dict(bsdf)
+                print("loads")
+            except RuntimeError as error:
+                print(" ".join(str(error).split()))
+        """,
+        "scalar_rgb",
+        *bsdfs,
+    )
+    for (change, message), line in zip(cases, said, strict=True):
+        assert (message or "loads") in line, change
