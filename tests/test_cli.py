@@ -77,12 +77,10 @@ def test_the_examples_of_the_documentation_parse():
     blocks = [
         b for page in pages for b in re.findall(r"^```(?:sh)?\n(.*?)^```", page.read_text(), re.M | re.S)
     ]
-    lines = [
-        line.split("  #")[0] for block in blocks for line in block.splitlines() if line.startswith("nma ")
-    ]
+    lines = [line for block in blocks for line in block.splitlines() if line.startswith("nma ")]
     assert len(lines) > 20
     for line in lines:
-        _, command, *arguments = shlex.split(line)
+        _, command, *arguments = shlex.split(re.split(r"\s# ", line)[0])
         APP.commands[command].make_context(command, arguments)
 
 

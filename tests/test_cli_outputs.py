@@ -10,6 +10,7 @@ import pytest
 from cli_cases import commands, parameters
 from typer.models import ArgumentInfo
 
+import nma.render.demo  # noqa: F401  # what tests replace in it must be there before
 from nma import table
 from nma.image_io import write_exr
 from nma.table import Tables
@@ -26,6 +27,11 @@ def arguments(words, output):
             given.append(output if name == "output" else "nothing.exr")
     positional = "output" in [n for n, _, i in parameters(FUNCTIONS[words]) if isinstance(i, ArgumentInfo)]
     return (*words, *given, *(() if positional else ("-o", output)))
+
+
+def _renders_nothing(monkeypatch):
+    for function in ("progressive.render_passes", "demo.render_passes", "demo.measure"):
+        monkeypatch.setattr(f"nma.render.{function}", None)
 
 
 @pytest.fixture
@@ -111,8 +117,7 @@ def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     write_exr("a.exr", np.zeros((16, 16, 3)))
     write_exr("b.exr", np.zeros((16, 16, 3)))
-    monkeypatch.setattr("nma.render.progressive.render_passes", None)
-    monkeypatch.setattr("nma.render.measure.measure", None)
+    _renders_nothing(monkeypatch)
     for name in ("skimage", "skimage.metrics"):
         monkeypatch.setitem(sys.modules, name, None)
     code, out, err = nma(*words)
@@ -132,8 +137,7 @@ def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, mo
 )
 def test_what_fails_in_the_end_fails_at_once(nma, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
-    for function in ("progressive.render_passes", "measure.measure", "measure.render_seconds"):
-        monkeypatch.setattr(f"nma.render.{function}", None)
+    _renders_nothing(monkeypatch)
     code, out, err = nma(*words)
     assert (code, out) == (1, "")
     assert message in err.splitlines()[-1] and err.splitlines()[-1].startswith("nma: ")
