@@ -48,6 +48,16 @@ def test_all_commands_that_write_are_known():
     assert {("library", "encode"), ("library", "extract"), ("train-library",)} <= set(WRITING)
 
 
+@pytest.mark.parametrize("output", [".", "..", "/", ""])
+def test_a_folder_is_no_output(nma, bad, output):
+    for words in WRITING:
+        if words != ("dataset",):  # which is a folder
+            code, out, err = nma(*arguments(words, output))
+            assert code in (1, 2) and out == "", words
+            assert "cannot be written" in err or "must end in" in err, words
+    assert [path.name for path in bad.iterdir()] == ["file"]
+
+
 @pytest.mark.parametrize("words", WRITING, ids="-".join)
 @pytest.mark.parametrize("place", ["file/sub/x{}", "n" * 300 + "{}", "full/x{}"])
 def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(

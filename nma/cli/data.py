@@ -90,9 +90,9 @@ def simulate(
     from nma import sources
     from nma.table import Tables, kept, stream_keys, tabulate
 
+    files.try_file(output)
     # Finished materials wait beside the output, so that a killed run goes on where it stopped.
     parts = output.with_name(output.name + ".parts")
-    files.try_file(output)
     files.try_folder(parts)
     source = sources.get(class_name)
     vectors = _vectors(source.space, params, material, draw, population, seed)

@@ -87,8 +87,9 @@ def train(
     from nma.train import recipe as recipes
     from nma.train import run as training
 
+    files.try_file(output)
     checkpoint = output.with_name(output.name + ".ckpt")
-    files.try_file(output, checkpoint, console.loss_plot(output))
+    files.try_file(checkpoint, console.loss_plot(output))
     lobes, directional = options.VARIANTS[variant]
     recipe = recipes.preset(
         preset,
@@ -154,7 +155,8 @@ def fit(
     from nma.train.fit import fit as fit_one
     from nma.train.fit import recipe_for
 
-    files.try_file(output, console.loss_plot(output))
+    files.try_file(output)
+    files.try_file(console.loss_plot(output))
     known, record = read(source, material, walks, seed)
     lobes, directional = options.VARIANTS[variant]
     recipe = recipe_for(

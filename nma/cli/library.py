@@ -48,8 +48,9 @@ def train_library(
     from nma.train import library as training
     from nma.train.plot import plot_losses
 
+    files.try_file(output)
     kept, checkpoint = (output.with_name(output.name + ending) for ending in (".tables", ".ckpt"))
-    files.try_file(output, checkpoint, console.loss_plot(output))
+    files.try_file(checkpoint, console.loss_plot(output))
     files.try_folder(kept)
     members = collection.members(source)
     names = [member.name for member in members]
