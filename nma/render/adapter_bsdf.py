@@ -12,17 +12,20 @@ One that knows a single material wants none, and refuses those of another.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 from nma import target
-from nma.adapter import Adapter, shipped
-from nma.ops import Vec3
+from nma.adapter import Adapter, shipped, weights_file
+from nma.ops import Color, select
+from nma.render.bsdf import define_base, mean_of_samples, vec3
 from nma.render.curves import MIN_COS, Curves
 from nma.render.inputs import of_adapter
-from nma.render.layered import check_variant
 from nma.target import Blend, Plane
 
 DEFAULT_ADAPTER = "layered3-5x64"
+ALBEDO_POINTS = 64
 
 
 def define() -> type:
@@ -33,58 +36,67 @@ def define() -> type:
 
     mi: Any = mitsuba  # its types change with the variant
 
-    class Nma(mi.BSDF):
+    attached = mi.Float(0.0)  # has a gradient wherever gradients are not suspended
+    dr.enable_grad(attached)
+
+    class Nma(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            check_variant(mi.variant(), props.plugin_name())
             self.name = str(props.get("adapter", DEFAULT_ADAPTER))
             # Weights lie beside the scene, as the files of Mitsuba's own plugins do.
-            found = self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
-            self.adapter = Adapter.load(found)
+            self.adapter = load_once(
+                self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
+            )
             self.inputs = of_adapter(self.adapter, props)
             self._curves = self._make_curves()
-            self._last: Any = None
-            self._attached = mi.Float(0.0)  # has a gradient wherever gradients are not suspended
-            dr.enable_grad(self._attached)
+            self._recorded = _Recorded()
             self._warned = False
-            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-            if self.adapter.anisotropic:
-                flags |= mi.BSDFFlags.Anisotropic
-            if self.inputs.textured:
-                flags |= mi.BSDFFlags.SpatiallyVarying
-            self.m_components = [flags]
-            self.m_flags = flags
+            flags = [mi.BSDFFlags.Anisotropic] if self.adapter.anisotropic else []
+            self._declare(*flags, *([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             self.inputs.traverse(callback)
 
         def parameters_changed(self, keys: Any = ()) -> None:
-            self.inputs.check(keys)
-            self._curves = self._make_curves()
-            self._last = None
+            self.inputs.changed()
+            if self._curves is not None:
+                self._curves.update(self.inputs.columns())
 
         def to_string(self) -> str:
             return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
 
-        def eval(self, ctx, si, wo, active=True):
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx, si, wo, active=True):
-            return self.eval_pdf(ctx, si, wo, active)[1]
-
         def eval_pdf(self, ctx, si, wo, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return _eval_pdf(blend, self._plane(si), si, wo, active)
+            return self._eval_pdf(blend, si, wo, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return _sample(blend, self._plane(si), si, sample1, sample2, active)
+            return self._sample(blend, si, sample1, sample2, active)
 
         def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
             blend, active = self._prepare(ctx, si, active)
+            found = self._eval_pdf(blend, si, wo, active)
+            return *found, *self._sample(blend, si, sample1, sample2, active)
+
+        def _eval_pdf(self, blend: Blend, si, wo, active):
             plane = self._plane(si)
-            found = _eval_pdf(blend, plane, si, wo, active)
-            return *found, *_sample(blend, plane, si, sample1, sample2, active)
+            value, pdf = target.eval_pdf(blend, plane.enter(vec3(si.wi)), plane.enter(vec3(wo)))
+            return mi.Color3f(*value) & active, pdf & active
+
+        def _sample(self, blend: Blend, si, sample1, sample2, active):
+            plane = self._plane(si)
+            wo, value, pdf = target.sample(blend, plane.enter(vec3(si.wi)), sample1, sample2.x, sample2.y)
+            return self._sampled(plane.leave(wo), pdf, value * (1.0 / select(pdf > 0, pdf, 1.0)), active)
+
+        def _albedo(self, si, active) -> Color:
+            blend, plane = self._blend(si, active, active), self._plane(si)
+            wi = plane.enter(vec3(si.wi))
+
+            def draw(k, *u):
+                _, value, pdf = target.sample(blend, wi, *u)
+                return value * select(pdf > 0, 1.0 / select(pdf > 0, pdf, 1.0), 0.0)
+
+            return mean_of_samples(draw, ALBEDO_POINTS, active)
 
         def _make_curves(self) -> Curves | None:
             """What spares the network where nothing but cos(theta_i) varies."""
@@ -95,33 +107,31 @@ def define() -> type:
         def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
             """The blend at `si`, and the lanes that see the front."""
             self._warn_of_light_paths(ctx)
-            active = mi.Bool(active if ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) else False)
-            front = active & (si.wi.z > 0)
-            cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
-            if self._curves is not None:
-                return self._curves.at(cos_theta_i, front), front
-            return self._by_network(si, cos_theta_i, active, front), front
+            front = self._front(ctx, si, active)
+            return self._blend(si, active, front), front
 
-        def _by_network(self, si, cos_theta_i, active, front) -> Blend:
+        def _blend(self, si, active, front) -> Blend:
             """The blend at `si`.
 
             Of one point Mitsuba asks for the value and then for a sample, even where one call could give both: it does
-            not call `eval_pdf_sample` of Python BSDFs. The second takes what the first left in the same recording.
+            not call `eval_pdf_sample` of Python BSDFs. The second takes what the first left in the same basic block.
             """
-            seen = mi.SurfaceInteraction3f(si), active
-            key = dr.grad_enabled(self._attached), *dr.detail.collect_indices(seen)
-            last, self._last = self._last, None
-            if last is not None and last.key == key:
-                return last.blend
+            self.inputs.check()
+            cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
+            if self._curves is not None:
+                return self._curves.at(cos_theta_i, front)
+            asked = mi.SurfaceInteraction3f(si), active
+            if blend := self._recorded.take(asked, dr.grad_enabled(attached)):
+                return blend
             columns, tangent = self.inputs.columns(si, front), (si.wi.x, si.wi.y)
             blend = self.adapter.prepare(columns, cos_theta_i, front, tangent)
             if si.wi.z.state == dr.VarState.Symbolic:
-                self._last = _Prepared(key, seen, blend)
+                self._recorded.leave(asked, dr.grad_enabled(attached), blend)
             return blend
 
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""
-            return Plane.of(_vec3(si.wi)) if self.adapter.in_plane else Plane()
+            return Plane.of(vec3(si.wi)) if self.adapter.in_plane else Plane()
 
         def _warn_of_light_paths(self, ctx) -> None:
             """Says once that light traced from its source makes another picture, where it does."""
@@ -134,31 +144,45 @@ def define() -> type:
                 "trace paths from the light converge to another picture than `path`; use `path` or `prb`",
             )
 
-    def _eval_pdf(blend: Blend, plane: Plane, si, wo, active):
-        value, pdf = target.eval_pdf(blend, plane.enter(_vec3(si.wi)), plane.enter(_vec3(wo)))
-        return mi.Color3f(*value) & active, pdf & active
-
-    def _sample(blend: Blend, plane: Plane, si, sample1, sample2, active):
-        wo, value, pdf = target.sample(blend, plane.enter(_vec3(si.wi)), sample1, sample2.x, sample2.y)
-        valid = active & (pdf > 0)
-        bs = dr.zeros(mi.BSDFSample3f)
-        bs.wo = mi.Vector3f(*plane.leave(wo))
-        bs.pdf = pdf & valid
-        bs.eta = 1.0
-        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-        bs.sampled_component = mi.UInt32(0)
-        return bs, (mi.Color3f(*value) / dr.select(valid, pdf, 1.0)) & valid
-
     return Nma
 
 
-class _Prepared(NamedTuple):
-    """A blend, what it was prepared for, and the names of that: no other variables bear them while these are kept."""
+def load_once(name_or_path: str) -> Adapter:
+    """The adapter of a name or a weights file; BSDFs of the same file share it for as long as the file is unchanged."""
+    path = weights_file(name_or_path)
+    stat = Path(path).stat() if Path(path).is_file() else None
+    return _loaded(name_or_path, (stat.st_mtime_ns, stat.st_size) if stat else None)
 
-    key: tuple[int, ...]
-    seen: Any
-    blend: Blend
+
+@lru_cache(maxsize=16)
+def _loaded(name_or_path: str, stamp: tuple[int, int] | None) -> Adapter:
+    return Adapter.load(name_or_path)
 
 
-def _vec3(v: Any) -> Vec3:
-    return Vec3(v.x, v.y, v.z)
+class _Recorded:
+    """The blend that a call prepared while Dr.Jit recorded it, for the next call in the same basic block.
+
+    Elsewhere its variables may not exist: Dr.Jit records all callables of a virtual call with the same arguments, in
+    scopes that begin anew. So what was prepared is followed by a scope of its own, and only that may take it. The
+    arguments are kept, as the numbers of Dr.Jit's variables are given out anew when one is gone. Frozen functions do
+    not look into this class: they must not find symbolic variables.
+    """
+
+    def __init__(self) -> None:
+        self._left: tuple[list[int], Any, Blend] | None = None
+
+    def leave(self, asked: Any, attached: bool, blend: Blend) -> None:
+        from nma.jit import dr
+
+        dr.detail.new_scope(dr.backend_v(asked[0].wi))
+        self._left = _key(asked, attached), asked, blend
+
+    def take(self, asked: Any, attached: bool) -> Blend | None:
+        left, self._left = self._left, None
+        return left[2] if left and left[0] == _key(asked, attached) else None
+
+
+def _key(asked: Any, attached: bool) -> list[int]:
+    from nma.jit import dr
+
+    return [attached, dr.detail.scope(dr.backend_v(asked[0].wi)), *dr.detail.collect_indices(asked)]

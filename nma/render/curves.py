@@ -27,6 +27,9 @@ class Curves:
     Any mixture of such numbers is a valid blend again. Derivatives reach the parameters that the curves were made from.
     """
 
+    # Frozen functions of Dr.Jit look for variables here.
+    DRJIT_STRUCT = {"table": object, "layers": list}  # noqa: RUF012
+
     def __init__(self, adapter: Adapter, columns: Sequence[Float], nodes: int = NODES):
         """
         Args:
@@ -37,12 +40,18 @@ class Curves:
         mi = _mitsuba()
         self.adapter = adapter
         self.nodes = nodes if adapter.directional else 2
+        self.packets = -(-adapter.size // PACKET)
+        self.layers = [(mi.TensorXf(matrix), mi.TensorXf(bias)) for matrix, bias in adapter.layers]
+        self.update(columns)
+
+    def update(self, columns: Sequence[Float]) -> None:
+        """Makes the curves of other parameters, by the same kernels where only the numbers are others."""
+        mi = _mitsuba()
         cosines = dr.maximum(dr.linspace(mi.Float, 0.0, 1.0, self.nodes), MIN_COS)
-        flat = numbers(_prepare(adapter, columns, cosines), adapter.target)
+        flat = numbers(_prepare(self.adapter, self.layers, columns, cosines), self.adapter.target)
 
         # Node by node, filled up to whole packets.
-        self.packets = -(-adapter.size // PACKET)
-        flat += [0.0] * (self.packets * PACKET - adapter.size)
+        flat += [0.0] * (self.packets * PACKET - self.adapter.size)
         self.table = _interleaved(flat, self.nodes)
         dr.eval(self.table)
 
@@ -63,12 +72,11 @@ class Curves:
         return dr.gather(_mitsuba().ArrayXf, self.table, index, active, shape=(PACKET, dr.width(index)))
 
 
-def _prepare(adapter: Adapter, columns: Sequence[Float], cos_theta_i: Float) -> Blend:
+def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], cos_theta_i: Float) -> Blend:
     """`Adapter.prepare` by products of matrices: a few small kernels instead of a large one to compile."""
     mi = _mitsuba()
     inputs = encoding.get(adapter.encoding)(columns, cos_theta_i if adapter.directional else None)
     x = mi.TensorXf(_interleaved(inputs, dr.width(cos_theta_i)), (dr.width(cos_theta_i), len(inputs)))
-    layers = [(mi.TensorXf(matrix), mi.TensorXf(bias)) for matrix, bias in adapter.layers]
     raw = network.forward(layers, x)
     return adapter.decode([raw[:, k].array for k in range(adapter.size)], cos_theta_i)
 

@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nma import materials, ops
+from nma import materials
 from nma.adapter import Adapter
 from nma.errors import ParamError, TextureError
+from nma.ops import Float, select
 from nma.params import MEASURED, Bounds, Param, ParamSpace
+from nma.render.input_checks import CHANNELS, Allowed, check_numbers, check_texture
 from nma.render.scene import bitmap_texture
 
 
@@ -19,13 +20,19 @@ class Inputs:
     """The parameters of a class, read from a BSDF's properties.
 
     A property has a parameter's name. A number or a colour is taken as it is, unbounded and linear, since refractive
-    indices are no reflectances; textures that hold such numbers want `raw`. The property `material` names a material
+    indices are no reflectances; textures that hold such numbers want `raw`. The property `NAME_channel` ("r", "g" or
+    "b") chooses a channel of a coloured texture for a parameter of one number. The property `material` names a material
     (shipped, or a `.toml` file) whose values fill in for the parameters that are not given.
 
     `values` maps each name to a `mi.Float` (size 1), a `mi.Color3f` (size 3) or a `mi.Texture`. Numbers and pixels must
-    be finite and within `bounds`; with `clamp` they are moved there instead. What a texture only knows while rendering
-    (mesh attributes) is moved there always.
+    be finite and within `bounds`; with `clamp` they are moved there instead. What cannot be known before rendering
+    (mesh attributes, edits inside of frozen functions) is moved there always.
+
+    Kernels take the numbers from memory: an edit compiles nothing, and materials of one structure share a kernel.
     """
+
+    # Frozen functions of Dr.Jit look for variables here.
+    DRJIT_STRUCT = {"values": dict}  # noqa: RUF012
 
     def __init__(self, space: ParamSpace, props: Any, bounds: Bounds = "valid", clamp: bool = False):
         self.space, self.bounds, self.clamp = space, bounds, clamp
@@ -39,7 +46,10 @@ class Inputs:
                 f"class {space.name}: no value for {', '.join(missing)}; give each a number, a colour or a texture, "
                 "or name a `material` that has them (`nma materials` lists those shipped)"
             )
-        self.values = {param.name: self._checked(param, given[param.name]) for param in space.params}
+        self.values = {param.name: _value(param, given[param.name]) for param in space.params}
+        self.chosen = {param.name: _channel(param, props, self.values[param.name]) for param in space.params}
+        self._seen = {name: _Seen(value) for name, value in self.values.items()}
+        self.check()
 
     @property
     def textured(self) -> tuple[str, ...]:
@@ -53,18 +63,20 @@ class Inputs:
 
         Without textures `si` is not needed. Gradients reach numbers, colours and textures.
         """
-        out = []
-        for param in self.space.params:
-            value = self.values[param.name]
-            if param.name in self.textured:
-                value = value.eval(si, active)
-                channels = [value.x, value.y, value.z][: param.size]
-            else:
-                channels = [value] if param.size == 1 else [value.x, value.y, value.z]
-            if param.name in self._moved:
-                channels = [ops.clip(c, *_finite(param.bounds(self.bounds))) for c in channels]
-            out += channels
-        return out
+        return [channel for param in self.space.params for channel in self.channels(param.name, si, active)]
+
+    def channels(self, name: str, si: Any = None, active: Any = True) -> list[Any]:
+        """The one or three numbers of a parameter, within its bounds."""
+        import mitsuba as mi
+
+        param, value = self.space[name], self.values[name]
+        if isinstance(value, mi.Texture):
+            value = value.eval(si, active)
+            channels = [value.x, value.y, value.z]
+            channels = channels if param.size == 3 else [channels[self.chosen[name] or 0]]
+        else:
+            channels = [value] if param.size == 1 else [value.x, value.y, value.z]
+        return [_within(c, *param.bounds(self.bounds)) for c in channels]
 
     def traverse(self, callback: Any, flags: Any = None) -> None:
         """Shows every input to `mi.traverse` under its name; differentiable unless `flags` say otherwise."""
@@ -76,34 +88,42 @@ class Inputs:
     def __str__(self) -> str:
         return ",\n".join(f"  {name} = {value}".replace("\n", "\n  ") for name, value in self.values.items())
 
-    _moved: frozenset[str] = frozenset()
+    def check(self) -> None:
+        """Checks the inputs that were changed since they were checked last. Raises `ParamError`, `TextureError`, and
+        puts back what was there: Dr.Jit records all BSDFs that there are, so one in error would stop other scenes, too.
 
-    def check(self, names: Iterable[str] = ()) -> None:
-        """Checks inputs again after they were changed in place: those that `names` start with, or all without names."""
+        Called wherever inputs are used as well: Mitsuba does not tell of edits of a texture that several BSDFs share. A
+        frozen function that is being recorded knows no values; what it sets is moved within bounds.
+        """
+        import drjit as dr
         import mitsuba as mi
 
-        chosen = {name.partition(".")[0] for name in names}
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return
         for param in self.space.params:
-            value = self.values[param.name]
-            if chosen and param.name not in chosen:
+            seen, value = self._seen[param.name], self.values[param.name]
+            if not seen.changed():
                 continue
-            if isinstance(value, mi.Texture):
-                _check_texture(param, value, self.bounds, self.clamp)
-            else:
-                _check_numbers(param, value, self.bounds, self.clamp)
+            allowed = Allowed(param, self.bounds, self.clamp)
+            try:
+                if isinstance(value, mi.Texture):
+                    check_texture(allowed, value, seen.leaves(), self.chosen[param.name])
+                else:
+                    check_numbers(allowed, value)
+            except (ParamError, TextureError):
+                seen.put_back()
+                raise
+            seen.remember()
 
-    def _checked(self, param: Param, value: Any) -> Any:
-        """The input, within bounds, in the form of `values`."""
+    def changed(self, names: Iterable[str] = ()) -> None:
+        """Takes note of edits in place of those that `names` start with, and checks them."""
+        import drjit as dr
         import mitsuba as mi
 
-        if self.clamp:
-            self._moved |= {param.name}
-        if isinstance(value, mi.Texture):
-            if not _check_texture(param, value, self.bounds, self.clamp):
-                self._moved |= {param.name}
-            return value
-        numbers = _check_numbers(param, value, self.bounds, self.clamp).tolist()
-        return mi.Float(numbers[0]) if param.size == 1 else mi.Color3f(numbers)
+        for value in self.values.values():
+            if not isinstance(value, mi.Texture):
+                dr.make_opaque(value)  # Mitsuba sets literals, which would be compiled into the kernel
+        self.check()
 
 
 def of_adapter(adapter: Adapter, props: Any) -> Inputs:
@@ -111,27 +131,103 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
 
     Parameters that are given all the same must be that material's. Raises `ParamError`.
     """
+    import mitsuba as mi
+
     clamp, known = props.get("clamp", False), adapter.material
     if known is None:
         return Inputs(adapter.space, props, "training", clamp)
     given = _material_values(props["material"], adapter.space) if "material" in props else {}
     given |= {param.name: _read(param, props) for param in adapter.space.params if param.name in props}
-    for param in adapter.space.params:
-        if param.name in given:
-            columns, value = adapter.space.slices[param.name], given[param.name]
-            adapter.check([*known[: columns.start], *_numbers(param, value), *known[columns.stop :]])
+    for name, value in given.items():
+        if isinstance(value, mi.Texture):
+            raise ParamError(
+                f"the adapter knows a single material, so that no texture can drive {name}; leave it out"
+            )
+        whole = known.copy()
+        whole[adapter.space.slices[name]] = value
+        adapter.check(whole)
     return Inputs(MEASURED, {}, "training")
 
 
-def _numbers(param: Param, value: Any) -> NDArray:
-    """A parameter's numbers; textures, which adapters of a single material do not look at, are refused."""
+class _Seen:
+    """The numbers behind an input: as they are, and as they were when they were checked.
+
+    Keeps the arrays that were checked, as the numbers of Dr.Jit's variables are given out anew when one is gone.
+    """
+
+    def __init__(self, value: Any):
+        import mitsuba as mi
+
+        self._number = None if isinstance(value, mi.Texture) else value
+        self._params = mi.traverse(value) if self._number is None else {}
+        self._names = [key for key, _ in self._params.items() if _known(key)]
+        self._checked: list[Any] | None = None
+
+    def leaves(self) -> list[Any]:
+        """The arrays of pixels and numbers, as they are."""
+        if self._number is not None:
+            return [self._number]
+        return [self._params[name] for name in self._names]
+
+    def changed(self) -> bool:
+        return self._checked is None or _indices(self._checked) != _indices(self.leaves())
+
+    def remember(self) -> None:
+        import drjit as dr
+
+        leaves = self.leaves()
+        for leaf in leaves:
+            dr.make_opaque(leaf)
+        self._checked = [type(leaf)(dr.detach(leaf)) for leaf in leaves]
+
+    def put_back(self) -> None:
+        """What was checked last, if anything was."""
+        import mitsuba
+
+        mi: Any = mitsuba  # its types do not know this function
+        if self._checked is None:
+            return
+        if self._number is not None:
+            mi.set_property(self._number, self._checked[0])
+            return
+        for name, leaf in zip(self._names, self._checked, strict=True):
+            self._params[name] = leaf
+        self._params.update()
+
+
+def _known(key: str) -> bool:
+    """Whether a texture shows the numbers that it is made of under this key."""
+    return key.rpartition(".")[2] in ("data", "value")
+
+
+def _indices(values: list[Any]) -> list[int]:
+    """The numbers of Dr.Jit's variables, without those of their derivatives."""
+    import drjit as dr
+
+    return [index & 0xFFFFFFFF for index in dr.detail.collect_indices(values)]
+
+
+def _within(x: Float, low: float, high: float) -> Float:
+    """`x` moved within the bounds, NaN to the lower one. On a bound the derivative is 1: values may come back."""
+    high = min(high, 1e30)
+    return select(x >= low, select(x <= high, x, high), low)
+
+
+def _value(param: Param, given: Any) -> Any:
+    """An input in the form of `values`."""
+    import drjit as dr
     import mitsuba as mi
 
-    if isinstance(value, mi.Texture):
-        raise ParamError(
-            f"the adapter knows a single material, so that no texture can drive {param.name}; leave it out"
-        )
-    return _check_numbers(param, value, "valid", False)
+    if isinstance(given, mi.Texture):
+        return given
+    numbers = list(given) if isinstance(given, (list, tuple)) else [given]
+    value = (
+        mi.Float(float(numbers[0]))
+        if param.size == 1
+        else mi.Color3f(numbers if len(numbers) > 1 else numbers[0])
+    )
+    dr.make_opaque(value)
+    return value
 
 
 def _read(param: Param, props: Any) -> Any:
@@ -142,22 +238,29 @@ def _read(param: Param, props: Any) -> Any:
     kind = props.type(param.name)
     value = props[param.name]
     if kind == kinds.Spectrum:
-        value = props.get_unbounded_texture(param.name)
+        return _numbers(param, _constant(props.get_unbounded_texture(param.name)))
     if isinstance(value, mi.Texture):
-        return _constant(value)
+        return value
     if kind in (kinds.Float, kinds.Integer):
         return float(value)
     if kind in (kinds.Color, kinds.Vector):
-        channels = [float(value[i]) for i in range(3)]
-        if param.size == 1 and len(set(channels)) > 1:
-            raise ParamError(f"{param.name} wants one number or a texture, got the colour {_plain(channels)}")
-        return channels[: param.size]
+        return _numbers(param, [float(value[i]) for i in range(3)])
     wanted = "a number, a texture" if param.size == 1 else "a number, a colour (rgb), a texture"
     raise ParamError(f"{param.name} wants {wanted}, got {str(kind).rpartition('.')[2].lower()} {value!r}")
 
 
+def _numbers(param: Param, channels: Any) -> Any:
+    """The numbers of a colour for the parameter; a grey one will do where one number is wanted."""
+    if not isinstance(channels, list) or param.size == 3:
+        return channels
+    if len(set(channels)) > 1:
+        colour = ", ".join(f"{x:g}" for x in channels)
+        raise ParamError(f"{param.name} wants one number or a texture, got the colour {colour}")
+    return channels[:1]
+
+
 def _constant(texture: Any) -> Any:
-    """The number or colour of a texture that is the same everywhere, or the texture itself."""
+    """The numbers of a texture that is the same everywhere, or the texture itself."""
     import mitsuba as mi
 
     params = mi.traverse(texture)
@@ -166,56 +269,19 @@ def _constant(texture: Any) -> Any:
     return [float(channel) for channel in np.ravel(params["value"])]
 
 
-def _check_numbers(param: Param, value: Any, bounds: Bounds, clamp: bool) -> NDArray:
-    """The parameter's numbers, within bounds."""
-    numbers = np.asarray(value, np.float64).ravel()
-    numbers = np.broadcast_to(numbers, param.size) if numbers.size == 1 else numbers
-    low, high = param.bounds(bounds)
-    slack = 1e-6 * max(abs(low), 1.0)
-    inside = np.isfinite(numbers) & (clamp | ((numbers >= low - slack) & (numbers <= high + slack)))
-    if numbers.size != param.size:
-        raise ParamError(f"{param.name} wants {param.size} number(s), got {numbers.size}")
-    if not inside.all():
-        raise ParamError(f"{param.name} is {_plain(numbers)}, allowed is {_range(param, bounds)}")
-    return np.clip(numbers, low, high)
-
-
-def _check_texture(param: Param, texture: Any, bounds: Bounds, clamp: bool) -> bool:
-    """Checks all numbers that a texture is made of; False if it shows none before it is rendered."""
+def _channel(param: Param, props: Any, value: Any) -> int | None:
+    """Which channel of a texture a parameter of one number takes, if that is said."""
     import mitsuba as mi
 
-    found = [value for key, value in mi.traverse(texture) if key.rpartition(".")[2] in ("data", "value")]
-    for values in map(np.array, found):
-        _check_pixels(param, _decoded(values, texture), bounds, clamp, texture.id())
-    return bool(found)
-
-
-def _decoded(pixels: NDArray, texture: Any) -> NDArray:
-    """The numbers that the texture evaluates to: Mitsuba keeps pixels of 8-bit files as bytes, sRGB unless `raw`."""
-    if pixels.dtype != np.uint8:
-        return pixels
-    unit = pixels / 255.0
-    if "raw = 1" in str(texture):
-        return unit
-    return np.where(unit <= 0.04045, unit / 12.92, ((unit + 0.055) / 1.055) ** 2.4)
-
-
-def _check_pixels(param: Param, pixels: NDArray, bounds: Bounds, clamp: bool, name: str) -> None:
-    where = f"the texture of {param.name}" + (f" ({name})" if name else "")
-    low, high = param.bounds(bounds)
-    slack = 1e-6 * max(abs(low), 1.0)
-    bad = ~np.isfinite(pixels)
-    if not clamp:
-        bad |= ~((pixels >= low - slack) & (pixels <= high + slack))
-    if bad.any():
-        first = np.argwhere(bad)[0]
-        place = f" at x={first[1]}, y={first[0]}" if pixels.ndim == 3 else ""
-        raise TextureError(
-            f"{where} holds {pixels[tuple(first)]}{place}, one of {bad.sum()} such values of {bad.size}; "
-            f"allowed is {_range(param, bounds)}"
-        )
-    if param.size == 1 and pixels.ndim == 3 and np.ptp(pixels, axis=-1).max() > 1e-6:
-        raise TextureError(f"{where} is coloured; a grey one is wanted, for one number per pixel")
+    name = f"{param.name}_channel"
+    if name not in props:
+        return None
+    wanted = props[name]
+    if param.size > 1 or not isinstance(value, mi.Texture):
+        raise ParamError(f"{name} chooses a channel of a texture for a parameter of one number; leave it out")
+    if wanted not in CHANNELS:
+        raise ParamError(f"{name} is {wanted!r}; take {', '.join(CHANNELS)}")
+    return CHANNELS.index(wanted)
 
 
 def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
@@ -235,21 +301,3 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
         else value
         for key, value in material.values.items()
     }
-
-
-def _range(param: Param, bounds: Bounds) -> str:
-    low, high = param.bounds(bounds)
-    hint = (
-        ", the range that the adapter was trained on; set `clamp` to move it there"
-        if bounds == "training"
-        else ""
-    )
-    return f"{low:g} .. {high:g}" + hint
-
-
-def _finite(bounds: tuple[float, float]) -> tuple[float, float]:
-    return bounds[0], min(bounds[1], 1e30)
-
-
-def _plain(numbers: Any) -> str:
-    return ", ".join(f"{x:g}" for x in numbers)

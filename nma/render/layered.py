@@ -1,8 +1,12 @@
 """Mitsuba 3 BSDF `layered`: the simulated material itself, the reference for its adapter.
 
-`sample` is one walk, `eval` one unbiased estimate, so both are noisy and no two evaluations agree; their means do.
-`eval` is given no random numbers and makes its own from the bits of its arguments. Multiple importance sampling stays
-unbiased with any density of wi and wo that is positive where f is, provided all methods report the same; that is `pdf`.
+`eval` is one unbiased estimate, so no two evaluations agree; their means do. It is given no random numbers and makes
+its own from the bits of its arguments. Multiple importance sampling stays unbiased with any density of wi and wo that
+is positive where f is, provided all methods report the same; that is `pdf`.
+
+`sample` is one walk. What blends BSDFs (`blendbsdf`, `mask`) takes weight times pdf for the value of a sample, which no
+walk knows. Inside of those, `sample` draws from `pdf` and weighs by an estimate of the value: right in any combination,
+but with 1 to 1.4 times the variance of a walk, and slower.
 Inputs: `nma.render.inputs`, with the parameters of class `layered3`. One-sided; wrap it in `twosided` if needed.
 """
 
@@ -10,13 +14,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from nma.errors import ParamError
-from nma.ops import Color, Vec3, select
+from nma.ops import Color, select
 from nma.params import LAYERED3
+from nma.render.bsdf import blended, define_base, mean_of_samples, vec3
 from nma.render.inputs import Inputs
 from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3, Layers
+
+# Walks behind the albedo of a point, the same random numbers everywhere: no noise, but an error of about .03.
+ALBEDO_WALKS = 64
 
 
 def define() -> type:
@@ -29,75 +36,75 @@ def define() -> type:
 
     source = Layered3()
 
-    class Layered(mi.BSDF):
+    class Layered(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            check_variant(mi.variant(), props.plugin_name())
             self.inputs = Inputs(LAYERED3, props)
-            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-            if self.inputs.textured:
-                flags |= mi.BSDFFlags.SpatiallyVarying
-            self.m_components = [flags]
-            self.m_flags = flags
+            self._declare(*([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             self.inputs.traverse(callback, mi.ParamFlags.NonDifferentiable)
 
+        def parameters_changed(self, keys: Any = ()) -> None:
+            self.inputs.changed()
+
         def to_string(self) -> str:
             return f"Layered[\n{self.inputs}\n]"
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            with dr.suspend_grad():
-                layers, active = self._prepare(ctx, si, active)
-                return self._sample(layers, si, sample1, sample2, active)
-
-        def eval(self, ctx, si, wo, active=True):
-            return self.eval_pdf(ctx, si, wo, active)[0]
 
         def pdf(self, ctx, si, wo, active=True):
             with dr.suspend_grad():
                 layers, active = self._prepare(ctx, si, active)
-                return dr.select(active & (wo.z > 0), layered_eval.pdf(layers, _vec3(si.wi), _vec3(wo)), 0.0)
+                return dr.select(active & (wo.z > 0), layered_eval.pdf(layers, vec3(si.wi), vec3(wo)), 0.0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             with dr.suspend_grad():
                 layers, active = self._prepare(ctx, si, active)
-                return self._eval_pdf(layers, si, wo, active)
+                return self._estimate(layers, si, wo, active)
 
-        def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
+        def sample(self, ctx, si, sample1, sample2, active=True):
             with dr.suspend_grad():
                 layers, active = self._prepare(ctx, si, active)
-                value, pdf = self._eval_pdf(layers, si, wo, active)
-                return value, pdf, *self._sample(layers, si, sample1, sample2, active)
+                draw = self._draw if blended(self) else self._walk
+                wo, weight = draw(layers, si, (sample1, sample2.x, sample2.y), active)
+                pdf = layered_eval.pdf(layers, vec3(si.wi), vec3(wo))
+                return self._sampled(vec3(wo), pdf, vec3(weight), active & dr.any(weight > 0))
 
         def _prepare(self, ctx, si, active) -> tuple[Layers, Any]:
             """The layers at `si`, and the lanes that see their front."""
-            active = mi.Bool(active) & (si.wi.z > 0)
-            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-                active = mi.Bool(False)
-            return layered_eval.settle(source.gather(self.inputs.columns(si, active))), active
+            self.inputs.check()
+            front = self._front(ctx, si, active)
+            return self._layers(si, front), front
 
-        def _sample(self, layers, si, sample1, sample2, active):
-            rng = _random(sample1, sample2.x, sample2.y, *si.wi)
-            wo, throughput = walk(source, layers, _vec3(si.wi), rng, active)
-            pdf = layered_eval.pdf(layers, _vec3(si.wi), wo)
-            left = active & ((throughput.x > 0) | (throughput.y > 0) | (throughput.z > 0)) & (pdf > 0)
+        def _layers(self, si, active) -> Layers:
+            return layered_eval.settle(source.gather(self.inputs.columns(si, active)))
 
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = mi.Vector3f(*wo)
-            bs.pdf = dr.select(left, pdf, 0.0)
-            bs.eta = 1.0
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            bs.sampled_component = mi.UInt32(0)
-            return bs, mi.Color3f(*select(left, throughput, Color.of(0.0)))
+        def _walk(self, layers, si, u, active):
+            """One walk's direction and throughput."""
+            wo, throughput = walk(source, layers, vec3(si.wi), _random(*u, *si.wi), active)
+            return mi.Vector3f(*wo), mi.Color3f(*throughput)
 
-        def _eval_pdf(self, layers, si, wo, active):
+        def _draw(self, layers, si, u, active):
+            """A direction of density `pdf`, and an estimate of the value there over it."""
+            wo = mi.Vector3f(*layered_eval.sample(layers, vec3(si.wi), *u))
+            value, pdf = self._estimate(layers, si, wo, active)
+            return wo, value / dr.select(pdf > 0, pdf, 1.0)
+
+        def _estimate(self, layers, si, wo, active):
             active = active & (wo.z > 0)
-            wi, wo_local = _vec3(si.wi), _vec3(wo)
+            wi, wo_local = vec3(si.wi), vec3(wo)
             rng = _random(*wo, *si.wi, *si.p, *si.uv)
             value = layered_eval.evaluate(layers, wi, wo_local, rng, active)
             pdf = layered_eval.pdf(layers, wi, wo_local)
             return mi.Color3f(*select(active, value, Color.of(0.0))), dr.select(active, pdf, 0.0)
+
+        def _albedo(self, si, active) -> Color:
+            with dr.suspend_grad():
+                layers, wi = self._layers(si, active), vec3(si.wi)
+
+                def draw(k, *_):
+                    return walk(source, layers, wi, _random(mi.Float(k)), active)[1]
+
+                return mean_of_samples(draw, ALBEDO_WALKS, active)
 
     def _random(*numbers: Any) -> Any:
         """A random stream that depends on the bits of `numbers`."""
@@ -111,17 +118,3 @@ def define() -> type:
         return mi.PCG32(1, state, mi.UInt64(b))
 
     return Layered
-
-
-def check_variant(variant: str, plugin: str) -> None:
-    """Refuses variants other than the vectorised RGB ones."""
-    if not variant.endswith("_ad_rgb"):
-        raise ParamError(
-            f"BSDF '{plugin}' runs in the variants llvm_ad_rgb and cuda_ad_rgb, not in {variant}: its parameters are "
-            "RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for "
-            "scalar_rgb with `nma mitsuba build`"
-        )
-
-
-def _vec3(v: Any) -> Vec3:
-    return Vec3(v.x, v.y, v.z)

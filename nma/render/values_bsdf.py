@@ -12,11 +12,13 @@ import math
 from typing import Any
 
 from nma import sources, target
-from nma.ops import Color, Vec3
-from nma.render.layered import check_variant
+from nma.ops import Color, select
+from nma.render.bsdf import define_base, mean_of_samples, vec3
 from nma.sources.base import Values
 from nma.target import Blend, Principled
 
+# Points of the quadrature that gives the albedo.
+ALBEDO_POINTS = 256
 # Widths of the reflections that directions are drawn from, beside the cosine.
 _ALPHAS = (0.02, 0.08, 0.3)
 _WHITE = Color(1.0, 1.0, 1.0)
@@ -46,20 +48,13 @@ def define() -> type:
     """The plugin's class for Mitsuba's present variant."""
     import mitsuba
 
-    from nma.jit import dr
-
     mi: Any = mitsuba  # its types change with the variant
 
-    class ValuesBsdf(mi.BSDF):
+    class ValuesBsdf(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            check_variant(mi.variant(), props.plugin_name())
             self.values = _IN_MEMORY[int(props["source"])] if "source" in props else self._read(props)
-            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-            if not self.values.isotropic:
-                flags |= mi.BSDFFlags.Anisotropic
-            self.m_components = [flags]
-            self.m_flags = flags
+            self._declare(*([] if self.values.isotropic else [mi.BSDFFlags.Anisotropic]))
 
         @staticmethod
         def _read(props: mi.Properties) -> Values:
@@ -70,40 +65,26 @@ def define() -> type:
         def to_string(self) -> str:
             return f"Values[\n  source = {self.values.name}\n]"
 
-        def eval(self, ctx, si, wo, active=True):
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx, si, wo, active=True):
-            return target.pdf(_PROPOSAL, _vec3(si.wi), _vec3(wo)) & self._active(ctx, si, active)
-
         def eval_pdf(self, ctx, si, wo, active=True):
-            return self._eval_pdf(si, _vec3(wo), self._active(ctx, si, active))
+            value, pdf = self._eval_pdf(vec3(si.wi), vec3(wo), self._front(ctx, si, active))
+            return mi.Color3f(*value), pdf
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            wo, _, _ = target.sample(_PROPOSAL, _vec3(si.wi), sample1, sample2.x, sample2.y)
-            value, pdf = self._eval_pdf(si, wo, self._active(ctx, si, active))
-            valid = pdf > 0
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = mi.Vector3f(*wo)
-            bs.pdf = pdf
-            bs.eta = 1.0
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            bs.sampled_component = mi.UInt32(0)
-            return bs, (value / dr.select(valid, pdf, 1.0)) & valid
+            active = self._front(ctx, si, active)
+            wo, pdf, weight = self._draw(vec3(si.wi), (sample1, sample2.x, sample2.y), active)
+            return self._sampled(wo, pdf, weight, active)
 
-        def _active(self, ctx, si, active):
-            """The lanes that see the front."""
-            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
-                return mi.Bool(False)
-            return mi.Bool(active) & (si.wi.z > 0)
+        def _albedo(self, si, active) -> Color:
+            return mean_of_samples(lambda k, *u: self._draw(vec3(si.wi), u, active)[2], ALBEDO_POINTS, active)
 
-        def _eval_pdf(self, si, wo, active):
-            wi = _vec3(si.wi)
-            pdf = target.pdf(_PROPOSAL, wi, wo) & active
-            return mi.Color3f(*self.values.eval(wi, wo)) & (pdf > 0), pdf
+        def _draw(self, wi, u, active):
+            """A direction, its density, and the value over it."""
+            wo, _, _ = target.sample(_PROPOSAL, wi, *u)
+            value, pdf = self._eval_pdf(wi, wo, active)
+            return wo, pdf, value * (1.0 / select(pdf > 0, pdf, 1.0))
+
+        def _eval_pdf(self, wi, wo, active):
+            pdf = select(active, target.pdf(_PROPOSAL, wi, wo), 0.0)
+            return select(pdf > 0, self.values.eval(wi, wo), Color.of(0.0)), pdf
 
     return ValuesBsdf
-
-
-def _vec3(v: Any) -> Vec3:
-    return Vec3(v.x, v.y, v.z)

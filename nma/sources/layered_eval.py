@@ -16,6 +16,7 @@ from nma.microfacet import (
     fresnel_conductor_rgb,
     fresnel_dielectric,
     ggx_d,
+    reflect,
     refract,
     sample_visible_normal,
     smith_g1,
@@ -267,6 +268,23 @@ def pdf(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
     mirrored = coat * _mirror_pdf(_above(wi), wo, layers.alpha_top)
     seen = bottom * _mirror_pdf(inside_i, inside_o, width) * jacobian
     return ops.select(wo.z > 0, mirrored + seen + diffuse * ops.INV_PI * wo.z, 0.0)
+
+
+def sample(layers: Layers, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
+    """A direction of density `pdf`, for three numbers uniform in [0, 1); one that does not point up is none at all."""
+    (coat, bottom, _), width = lobes(layers, wi)
+    on_coat, eta = u_lobe < coat, layers.eta_top
+    view = ops.select(on_coat, _above(wi), refract_flat(wi, eta))
+    alpha = ops.select(on_coat, layers.alpha_top, width)
+    mirrored = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
+    # Light from below leaves through a flat coat, which keeps in what meets it too obliquely.
+    cos2 = 1.0 - eta * eta * (1.0 - mirrored.z * mirrored.z)
+    leaves = (mirrored.z > 0) & (cos2 > 0)
+    seen = Vec3(mirrored.x * eta, mirrored.y * eta, ops.select(leaves, ops.safe_sqrt(cos2), -1.0))
+
+    r, phi = ops.safe_sqrt(u2), (2.0 * ops.PI) * u1
+    cosine = Vec3(r * ops.cos(phi), r * ops.sin(phi), ops.safe_sqrt(1.0 - u2))
+    return ops.select(on_coat, mirrored, ops.select(u_lobe < coat + bottom, seen, cosine))
 
 
 def refract_flat(w: Vec3, eta: Float) -> Vec3:

@@ -1,0 +1,181 @@
+"""What this package's Mitsuba BSDFs share: the variants they run in, one side, one glossy lobe, one kind of sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from typing import Any
+
+from nma.errors import ParamError
+from nma.ops import Color, Vec3, minimum
+
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+# Mitsuba's BSDFs that ask one other and hand on its answer.
+_HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
+# Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": powers of the inverse of this number, the
+# root of x^4 = x + 1, spread points evenly over a cube.
+_SPREAD = 1.2207440846057596
+
+
+def check_variant(variant: str, plugin: str) -> None:
+    """Refuses variants other than `VARIANTS`."""
+    if variant not in VARIANTS:
+        raise ParamError(
+            f"BSDF '{plugin}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters are RGB "
+            "and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for scalar_rgb "
+            "with `nma mitsuba build`"
+        )
+
+
+def define_base() -> type:
+    """The class below all our BSDFs, for Mitsuba's present variant.
+
+    A BSDF of ours has `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`), these are
+    what `mi.traverse` and attributes show.
+    """
+    import mitsuba
+
+    from nma.jit import dr
+
+    mi: Any = mitsuba  # its types change with the variant
+
+    class OneSided(mi.BSDF):
+        inputs: Any = None
+
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            check_variant(mi.variant(), props.plugin_name())
+
+        def _declare(self, *flags: mi.BSDFFlags) -> None:
+            """One component: glossy reflection on the front, with these flags besides."""
+            both = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            for flag in flags:
+                both |= flag
+            self.m_components = [both]
+            self.m_flags = both
+
+        def eval(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx, si, wo, active=True):
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
+            return *self.eval_pdf(ctx, si, wo, active), *self.sample(ctx, si, sample1, sample2, active)
+
+        def eval_diffuse_reflectance(self, si, active=True):
+            """The directional albedo at wi, at most 1: what denoisers and `aov` take for the colour of a surface."""
+            front = mi.Bool(active) & (si.wi.z > 0)
+            albedo = self._albedo(si, front)
+            return mi.Color3f(*(minimum(c, 1.0) for c in albedo)) & front
+
+        def has_attribute(self, name, active=True):
+            return name in self._attributes() or super().has_attribute(name, active)
+
+        def eval_attribute(self, name, si, active=True):
+            return self.eval_attribute_3(name, si, active)
+
+        def eval_attribute_1(self, name, si, active=True):
+            if name not in self._attributes():
+                return super().eval_attribute_1(name, si, active)
+            return self.inputs.channels(name, si, active)[0]
+
+        def eval_attribute_3(self, name, si, active=True):
+            if name not in self._attributes():
+                return super().eval_attribute_3(name, si, active)
+            channels = self.inputs.channels(name, si, active)
+            return mi.Color3f(*channels) if len(channels) == 3 else mi.Color3f(channels[0])
+
+        def _attributes(self) -> Any:
+            return self.inputs.values if self.inputs is not None else ()
+
+        def _front(self, ctx, si, active):
+            """The lanes that see the front, if our lobe is wanted."""
+            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+                return mi.Bool(False)
+            return mi.Bool(active) & (si.wi.z > 0)
+
+        def _sampled(self, wo: Vec3, pdf, weight: Color, active):
+            """What `sample` returns: a direction, its density, and value over density; all 0 where the density is."""
+            valid = active & (pdf > 0)
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = mi.Vector3f(*wo)
+            bs.pdf = dr.select(valid, pdf, 0.0)
+            bs.eta = 1.0
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+            bs.sampled_component = mi.UInt32(0)
+            return bs, dr.select(valid, mi.Color3f(*weight), 0.0)
+
+    return OneSided
+
+
+def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, active: Any = True) -> Color:
+    """The mean of draw(k, u1, u2, u3) over the same `points` points of the unit cube for every lane, k = 0, 1, ...
+
+    Equal lanes give equal means: there is no noise, but the small error that so many points leave.
+    """
+    import mitsuba
+
+    from nma.jit import dr
+
+    mi: Any = mitsuba
+
+    def body(k, x, y, z):
+        u = [mi.Float(k) * _SPREAD**-power + 0.5 for power in (1, 2, 3)]
+        found = draw(k, *(v - dr.floor(v) for v in u))
+        return k + 1, x + found.x, y + found.y, z + found.z
+
+    active = mi.Bool(active)
+    zero = dr.select(active, mi.Float(0.0), 0.0)
+    start = (dr.select(active, mi.UInt32(0), points), zero, zero, zero)
+    _, x, y, z = dr.while_loop(start, lambda k, *rest: k < points, body, label="albedo")
+    return Color(x, y, z) * (1.0 / points)
+
+
+def vec3(v: Any) -> Vec3:
+    """A vector of Mitsuba's for the physics of this package."""
+    return Vec3(v.x, v.y, v.z)
+
+
+def blended(bsdf: Any) -> bool:
+    """Whether Mitsuba holds a BSDF that blends `bsdf` with others, by any levels between.
+
+    A BSDF is not told of those around it, so this looks through all that there are. Those that only turn a frame or a
+    side hand on what they are given.
+    """
+    global _blends
+    everything = _registered()
+    key = [(type(other), other.class_name(), other.id()) for other in everything]
+    if _blends[0] != key:
+        _blends = key, _inside_blends(everything)
+    return id(bsdf) in _blends[1]
+
+
+# What `blended` found last: in which BSDFs, and the identities of those inside a blend.
+_blends: tuple[list[Any], set[int]] = [], set()
+
+
+def _registered() -> list[Any]:
+    """All BSDFs of Mitsuba's present variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found = []
+    for number in count(1):
+        try:
+            bsdf = dr.reinterpret_array(mi.BSDFPtr, mi.UInt32(number))[0]
+        except RuntimeError:  # beyond the last one
+            return found
+        if bsdf is not None:
+            found.append(bsdf)
+    return found
+
+
+def _inside_blends(everything: list[Any]) -> set[int]:
+    import mitsuba as mi
+
+    inside = set()
+    for bsdf in everything:
+        if bsdf.class_name() not in _HAND_ON:
+            inside |= {id(part) for part in mi.traverse(bsdf).hierarchy if part is not bsdf}
+    return inside

@@ -1,0 +1,101 @@
+"""Whether numbers and pixels are allowed for a parameter, and what to say where they are not."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nma.errors import ParamError, TextureError
+from nma.params import Bounds, Param
+
+CHANNELS = ("r", "g", "b")
+
+
+class Allowed(NamedTuple):
+    """What a parameter may be: within its `bounds`, or with `clamp` anything finite."""
+
+    param: Param
+    bounds: Bounds
+    clamp: bool
+
+    def bad(self, numbers: NDArray) -> NDArray[np.bool_]:
+        """Which numbers are not allowed; a rounding error beyond a bound is."""
+        low, high = self.param.bounds(self.bounds)
+        slack = 1e-6 * max(abs(low), 1.0)
+        inside = (numbers >= low - slack) & (numbers <= high + slack)
+        return ~np.isfinite(numbers) | (~inside & (not self.clamp))
+
+    def __str__(self) -> str:
+        low, high = self.param.bounds(self.bounds)
+        trained = ", the range that the adapter was trained on; set `clamp` to move it there"
+        return f"allowed is {low:g} .. {high:g}" + (trained if self.bounds == "training" else "")
+
+
+def check_numbers(allowed: Allowed, value: Any) -> None:
+    """Refuses numbers that are not allowed. Raises `ParamError`."""
+    numbers = _plain(value).ravel()
+    name, size = allowed.param.name, allowed.param.size
+    if numbers.size not in (1, size):
+        raise ParamError(f"{name} wants {size} number(s), got {numbers.size}")
+    if allowed.bad(numbers).any():
+        raise ParamError(f"{name} is {', '.join(f'{x:g}' for x in numbers)}, {allowed}")
+
+
+def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: int | None) -> None:
+    """Refuses textures that hold what is not allowed, or colours where one number is wanted. Raises `TextureError`.
+
+    Args:
+        leaves: the arrays of pixels and numbers that it is made of, as far as they are known before rendering.
+        channel: the one of its three that counts, if one was chosen.
+    """
+    name = f" ({texture.id()})" if texture.id() else ""
+    where = f"the texture of {allowed.param.name}{name}"
+    for values in map(_plain, leaves):
+        pixels = values if values.ndim == 3 else values.reshape(1, 1, -1)
+        try:
+            _check_pixels(allowed, _decoded(pixels, texture), where, channel)
+        except TextureError as error:
+            if pixels.dtype != np.uint8:
+                raise
+            hint = 'its pixels are bytes, 0 to 1; with `format` "variant" a bitmap keeps floats, which can be edited'
+            raise TextureError(f"{error}; {hint}") from None
+
+
+def _plain(value: Any) -> NDArray:
+    """The numbers of a Dr.Jit array. Colours go channel by channel: in one piece they would be scattered into an array,
+    which cannot be read while Dr.Jit records."""
+    import mitsuba as mi
+
+    return np.concatenate([np.array(c) for c in value]) if isinstance(value, mi.Color3f) else np.array(value)
+
+
+def _decoded(pixels: NDArray, texture: Any) -> NDArray:
+    """The numbers that the texture evaluates to: Mitsuba keeps pixels of 8-bit files as bytes, sRGB unless `raw`."""
+    if pixels.dtype != np.uint8:
+        return pixels
+    unit = pixels / 255.0
+    if "raw = 1" in str(texture):
+        return unit
+    return np.where(unit <= 0.04045, unit / 12.92, ((unit + 0.055) / 1.055) ** 2.4)
+
+
+def _check_pixels(allowed: Allowed, pixels: NDArray, where: str, channel: int | None) -> None:
+    """Pixels are (height, width, channels); a single number or colour is an image of one pixel."""
+    name, size = allowed.param.name, allowed.param.size
+    coloured = pixels.shape[-1] >= 3
+    if coloured and channel is not None:
+        pixels = pixels[..., channel : channel + 1]
+    elif size == 1 and coloured and np.ptp(pixels, axis=-1).max() > 1e-6:
+        raise TextureError(
+            f"{where} is coloured, and {name} is one number per pixel; choose a channel: set `{name}_channel` to "
+            f"{', '.join(CHANNELS[:-1])} or {CHANNELS[-1]}"
+        )
+    bad = allowed.bad(pixels)
+    if bad.any():
+        first = tuple(np.argwhere(bad)[0])
+        place = f" at x={first[1]}, y={first[0]}" if pixels.shape[:2] != (1, 1) else ""
+        raise TextureError(
+            f"{where} holds {pixels[first]}{place}, one of {bad.sum()} such values of {bad.size}; {allowed}"
+        )
