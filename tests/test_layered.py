@@ -73,20 +73,8 @@ def fixed(mu, n):
 
 
 def draw(layers, wi, rng):
-    """A wo from each lobe of `layered_eval.pdf` in proportion to its weight; z < 0 where the lobe gives none."""
-    (coat, bottom, _), width = layered_eval.lobes(layers, wi)
-    u, u1, u2 = (rng.next_float32() for _ in range(3))
-    # Mirrored in the coat's facets, or below the coat in facets of the conductor's apparent width and refracted out.
-    upper = u < coat
-    view = ops.select(upper, wi, layered_eval.refract_flat(wi, layers.eta_top))
-    alpha = dr.select(upper, layers.alpha_top, width)
-    out = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
-    x, y = out.x * layers.eta_top, out.y * layers.eta_top
-    z2 = 1.0 - x * x - y * y
-    refracted = Vec3(x, y, dr.select((out.z > 0) & (z2 > 0), ops.safe_sqrt(z2), -1.0))
-    r, phi = dr.sqrt(u1), 2.0 * np.pi * u2
-    cosine = Vec3(r * dr.cos(phi), r * dr.sin(phi), ops.safe_sqrt(1.0 - u1))
-    return ops.select(u < coat + bottom, ops.select(upper, out, refracted), cosine)
+    """A wo of density `layered_eval.pdf`; z < 0 where there is none."""
+    return layered_eval.sample(layers, wi, *(rng.next_float32() for _ in range(3)))
 
 
 def estimates(layers, wi, rng):

@@ -25,7 +25,7 @@ from nma.render.inputs import of_adapter
 from nma.target import Blend, Plane
 
 DEFAULT_ADAPTER = "layered3-5x64"
-ALBEDO_POINTS = 64
+ALBEDO_POINTS = 128
 
 
 def define() -> type:

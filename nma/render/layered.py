@@ -22,8 +22,8 @@ from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3, Layers
 
-# Walks behind the albedo of a point, the same random numbers everywhere: no noise, but an error of about .03.
-ALBEDO_WALKS = 64
+# Walks behind the albedo of a point, with the same random numbers everywhere: no noise, but an error of about .03.
+ALBEDO_WALKS = 128
 
 
 def define() -> type:
@@ -114,7 +114,8 @@ def define() -> type:
             a, b = (a ^ x, b) if i % 2 == 0 else (a, b ^ x)
             if i % 2 == 1 or i == len(bits) - 1:
                 a, b = mi.sample_tea_32(a, b)
-        state = (mi.UInt64(a) << 32) | mi.UInt64(b)
-        return mi.PCG32(1, state, mi.UInt64(b))
+        rng = mi.PCG32()  # whose own way to start gives every lane a stream of its own
+        rng.state, rng.inc = (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(b) << 1) | 1
+        return rng
 
     return Layered
