@@ -9,7 +9,6 @@ from scipy.stats import norm
 
 from nma import ops
 from nma.jit import dr
-from nma.microfacet import reflect, sample_visible_normal
 from nma.ops import Vec3
 from nma.params import LAYERED3
 from nma.sources import layered_eval
