@@ -19,34 +19,30 @@ class LayeredBSDF final : public SourceBSDF<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(SourceBSDF, inputs_, hidden)
     MI_IMPORT_TYPES(Shape)
+    using typename Base::Inputs;
 
     explicit LayeredBSDF(const Properties& props) : Base(props, nma::layered3_parameters(), false) {}
 
     Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
-        if (hidden(context, si)) return 0.0f;
-        const nma::layered::Layers layers = at(si);
-        return nma::layered::pdf(layers, nma::layered::Density(layers, direction(si.wi)), direction(si.wi), direction(wo));
+        return hidden(context, si) ? 0.0f : View(inputs_, si).pdf(wo);
     }
 
     std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f};
-        const nma::layered::Layers layers = at(si);
-        return evaluated(layers, nma::layered::Density(layers, direction(si.wi)), si, wo);
+        return evaluated(View(inputs_, si), si, wo);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u, const Point2f& u2, Mask) const override {
         if (hidden(context, si)) return {dr::zeros<BSDFSample3f>(), 0.0f};
-        const nma::layered::Layers layers = at(si);
-        return sampled(layers, nma::layered::Density(layers, direction(si.wi)), si, u, u2);
+        return sampled(View(inputs_, si), si, u, u2);
     }
 
     std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Float u,
                                                                         const Point2f& u2, Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
-        const nma::layered::Layers layers = at(si);
-        const nma::layered::Density density(layers, direction(si.wi));
-        const auto [value, pdf] = evaluated(layers, density, si, wo);
-        const auto [drawn, weight] = sampled(layers, density, si, u, u2);
+        const View view(inputs_, si);
+        const auto [value, pdf] = evaluated(view, si, wo);
+        const auto [drawn, weight] = sampled(view, si, u, u2);
         return {value, pdf, drawn, weight};
     }
 
@@ -55,59 +51,68 @@ public:
     MI_DECLARE_CLASS(LayeredBSDF)
 
 private:
-    nma::layered::Layers at(const SurfaceInteraction3f& si) const {
+    // The material at one shading point as it is seen there.
+    struct View {
+        nma::layered::Layers layers;
+        nma::layered::Vec wi;
+        nma::layered::Density density;
+
+        View(const Inputs& inputs, const SurfaceInteraction3f& si) : layers(at(inputs, si)), wi(direction(si.wi)), density(layers, wi) {}
+
+        float pdf(const Vector3f& wo) const { return nma::layered::pdf(layers, density, wi, direction(wo)); }
+    };
+
+    static nma::layered::Layers at(const Inputs& inputs, const SurfaceInteraction3f& si) {
         float numbers[13];
-        inputs_.at(si, numbers);
+        inputs.at(si, numbers);
         return nma::layered::Layers::of(numbers);
     }
 
-    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return nma::layered::albedo(at(si), direction(si.wi)); }
+    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return nma::layered::albedo(at(inputs_, si), direction(si.wi)); }
 
     // A stream of random numbers that depends on the bits of `numbers`.
     template <std::size_t N>
     static nma::layered::Random random(const float (&numbers)[N]) {
         std::uint32_t a = N, b = 0x9e3779b9u;
         for (std::size_t k = 0; k < N; ++k) {
-            std::uint32_t bits;
-            std::memcpy(&bits, numbers + k, sizeof(bits));
-            (k % 2 ? b : a) ^= bits;
+            (k % 2 ? b : a) ^= nma::bits(numbers[k]);
             if (k % 2 || k + 1 == N) std::tie(a, b) = sample_tea_32(a, b);
         }
         return nma::layered::Random(static_cast<std::uint64_t>(a) << 32 | b, b);
     }
 
-    static std::pair<Spectrum, Float> evaluated(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, const Vector3f& wo) {
+    static std::pair<Spectrum, Float> evaluated(const View& view, const SurfaceInteraction3f& si, const Vector3f& wo) {
         if (!(wo.z() > 0.0f)) return {0.0f, 0.0f};
         nma::layered::Random rng = random({wo.x(), wo.y(), wo.z(), si.wi.x(), si.wi.y(), si.wi.z(), si.p.x(), si.p.y(), si.p.z(), si.uv.x(), si.uv.y()});
-        const nma::Vec3<float> value = nma::layered::evaluate(layers, direction(si.wi), direction(wo), rng);
-        return {Spectrum(value.x, value.y, value.z), nma::layered::pdf(layers, density, direction(si.wi), direction(wo))};
+        const nma::Vec3<float> value = nma::layered::evaluate(view.layers, view.wi, direction(wo), rng);
+        return {Spectrum(value.x, value.y, value.z), view.pdf(wo)};
     }
 
-    std::pair<BSDFSample3f, Spectrum> sampled(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
+    std::pair<BSDFSample3f, Spectrum> sampled(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
         BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
         drawn.eta = 1.0f;
         drawn.sampled_type = +BSDFFlags::GlossyReflection;
         const bool alone = si.shape && si.shape->bsdf() == this;
-        const Spectrum weight = alone ? walked(layers, density, si, u, u2, drawn) : followed(layers, density, si, u, u2, drawn);
+        const Spectrum weight = alone ? walked(view, si, u, u2, drawn) : followed(view, si, u, u2, drawn);
         if (!(drawn.pdf > 0.0f)) return {dr::zeros<BSDFSample3f>(), 0.0f};
         return {drawn, weight};
     }
 
     // Where a walk leaves, and its throughput. The density is near its own.
-    static Spectrum walked(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
+    static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
         nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
-        const nma::layered::Walk walk = nma::layered::walk(layers, direction(si.wi), rng);
+        const nma::layered::Walk walk = nma::layered::walk(view.layers, view.wi, rng);
         const nma::Vec3<float>& t = walk.throughput;
         drawn.wo = Vector3f(walk.direction.x, walk.direction.y, walk.direction.z);
-        if (t.x > 0.0f || t.y > 0.0f || t.z > 0.0f) drawn.pdf = nma::layered::pdf(layers, density, direction(si.wi), walk.direction);
+        if (t.x > 0.0f || t.y > 0.0f || t.z > 0.0f) drawn.pdf = view.pdf(drawn.wo);
         return Spectrum(t.x, t.y, t.z);
     }
 
     // A direction that follows the density, and the estimate of `eval` over it.
-    static Spectrum followed(const nma::layered::Layers& layers, const nma::layered::Density& density, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
-        const nma::layered::Drawn found = nma::layered::sample(layers, density, direction(si.wi), u, u2.x(), u2.y());
-        drawn.wo = Vector3f(found.wo.x, found.wo.y, found.wo.z);
-        const auto [value, pdf] = evaluated(layers, density, si, drawn.wo);
+    static Spectrum followed(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
+        const nma::Vec3<float> wo = nma::layered::sample(view.layers, view.density, view.wi, u, u2.x(), u2.y()).wo;
+        drawn.wo = Vector3f(wo.x, wo.y, wo.z);
+        const auto [value, pdf] = evaluated(view, si, drawn.wo);
         drawn.pdf = pdf;
         return value / pdf;
     }
