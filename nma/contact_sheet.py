@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -59,9 +59,9 @@ def contact_sheet(
     """
     pictures = [[_display(image, row.label, exposure, shoulder) for image in row.images] for row in rows]
     height, width = _common_size(pictures, columns)
-    row_height = _line(TEXT_SIZE) + 4 + height + _caption_height(rows) + GAP
+    row_height = _label_height(row.label for row in rows) + height + _caption_height(rows) + GAP
     head = MARGIN + (_line(TITLE_SIZE) + GAP if title else 0)
-    top = head + _line(TEXT_SIZE) + 4
+    top = head + _label_height(columns)
     below = top + len(rows) * row_height
     note_top = below + _table_height(table) + (GAP if table else 0)
     bottom = note_top + (len(note.split("\n")) * _line(CAPTION_SIZE) if note else 0) + MARGIN
@@ -78,12 +78,19 @@ def contact_sheet(
         middle = MARGIN + index * (cell + GAP) + max(width, _width(name, TEXT_SIZE, bold=True)) / 2
         _text(draw, (middle, head), name, TEXT_SIZE, bold=True, anchor="ma")
     for index, (row, images) in enumerate(zip(rows, pictures, strict=True)):
-        _draw_row(sheet, top + index * row_height, row, images, cell)
+        _draw_row(
+            sheet, top + index * row_height, row, images, cell, _label_height(row.label for row in rows)
+        )
     _draw_table(draw, below, table)
     _text(draw, (MARGIN, note_top), note, CAPTION_SIZE, colour=QUIET)
     pixels = np.asarray(sheet)
     write_png(path, pixels)
     return pixels
+
+
+def _label_height(labels: Iterable[str]) -> int:
+    """Room for a line, where one of them is not empty."""
+    return _line(TEXT_SIZE) + 4 if any(labels) else 0
 
 
 def _caption_height(rows: Sequence[Row]) -> int:
@@ -118,11 +125,13 @@ def _cell_width(width: int, rows: Sequence[Row], columns: Sequence[str]) -> int:
     return max(width, *headings, *captions)
 
 
-def _draw_row(sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]], cell: int) -> None:
+def _draw_row(
+    sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]], cell: int, label_height: int
+) -> None:
     """The row's label, its images side by side, and a caption under each."""
     draw = ImageDraw.Draw(sheet)
     _text(draw, (MARGIN, top), row.label, TEXT_SIZE)
-    top += _line(TEXT_SIZE) + 4
+    top += label_height
     for index, image in enumerate(images):
         left = MARGIN + index * (cell + GAP)
         sheet.paste(Image.fromarray(image), (left, int(top)))

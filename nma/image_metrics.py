@@ -134,9 +134,9 @@ def _pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
     return a, b
 
 
-def ensure_libraries() -> None:
+def ensure_libraries(ssim: bool = True) -> None:
     """Raises `MissingDependencyError` unless all that metrics need is there: better before an hour of rendering."""
-    for name in ("flip_evaluator", "skimage.metrics"):
+    for name in ("flip_evaluator", *(["skimage.metrics"] if ssim else [])):
         _library(name)
 
 

@@ -83,15 +83,16 @@ install_package() { # GOAL EXTRA
     for stamp in .venv/installed-test ".venv/installed-$1"; do # what tests need holds what the demo needs
         if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ]; then return 0; fi
     done
-    say "installing the package and pinned versions of what it needs, which takes a few minutes"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check \
+    say "installing the package and pinned versions of what it needs, which takes a minute or a few"
+    # Modules are compiled when they are first imported: most never are.
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
         --constraint requirements.lock --editable ".[$2]" >&2
     printf '%s' "$wanted" >".venv/installed-$1"
 }
 
 goal=${1:-}
 case "$goal" in
-demo) extra=compare ;;
+demo) extra=demo ;;
 test) extra=dev ;;
 *) die "usage: tools/setup.sh demo|test" ;;
 esac
@@ -100,6 +101,14 @@ python=$(find_python)
 if [ -n "${DRJIT_LIBLLVM_PATH:-}" ]; then
     fault=$("$python" -I nma/llvm.py) || die "DRJIT_LIBLLVM_PATH: $fault; unset it"
 fi
-install_system
+# The system's packages arrive while pip works, where pip can do without them.
+apt=
+if "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+    install_system &
+    apt=$!
+else
+    install_system
+fi
 make_venv
 install_package "$goal" "$extra"
+[ -z "$apt" ] || wait "$apt"

@@ -205,17 +205,18 @@ def demo(
     adapter: _AdapterName = "layered3-5x64",
     size: _Size = "256",
     spp: Annotated[int, options.samples("Samples per pixel of the frames that are timed.")] = 64,
-    runs: Annotated[int, options.number("Frames of each kind, with seeds of their own.", 2, 1000)] = 3,
-    reference_spp: Annotated[int, options.samples("Samples per pixel of the converged reference.")] = 512,
+    runs: Annotated[int, options.number("Frames of each kind, with seeds of their own.", 2, 1000)] = 2,
+    reference_spp: Annotated[int, options.samples("Samples per pixel of the converged reference.")] = 144,
     variant: _Variant = "auto",
 ) -> None:
     """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.
 
-    Writes a sheet of pictures and prints the table below it. Takes about two minutes on two CPU cores.
+    Writes a sheet of pictures as soon as there are some, again whenever there is more to show, and prints the table
+    below it. Takes about a minute on two CPU cores.
     """
     from nma import image_metrics
 
-    image_metrics.ensure_libraries()
+    image_metrics.ensure_libraries(ssim=False)
     files.try_file(output)
     from nma.adapter import Adapter
     from nma.render import demo as demonstration
@@ -225,12 +226,11 @@ def demo(
     settings = demonstration.Settings(_pixels(size), spp, runs, reference_spp, adapter)
     use_rgb(variant)
     with _samples_bar("demo", demonstration.total_samples(settings)) as advance:
-        lines = demonstration.demo(output, settings, advance)
+        lines = demonstration.demo(output, settings, advance, lambda shown: console.say(f"{output}: {shown}"))
     for material in dict.fromkeys(line.material for line in lines):
         rows = [line.cells()[1:] for line in lines if line.material == material]
         console.out.print(console.table(demonstration.HEADINGS[1:], rows, material))
     console.out.print(demonstration.note(settings), highlight=False)
-    console.say(f"{output} shows the pictures")
 
 
 _PREVIEW = ("camera", "lighting", "envmap", "mesh", "mesh_up", "depth")  # of the preview scene

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from nma import materials
 from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import compare_images, difference_image
+from nma.image_metrics import difference_image, errors, flip_map
 from nma.materials import Material
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
-from nma.render.measure import Measurement, measure
-from nma.render.progressive import render_passes
+from nma.render.measure import Measurement, measure, render_seconds
+from nma.render.progressive import render_passes, sampler
 from nma.render.scene import bitmap_texture, preview_scene
 from nma.render.textures import procedural_textures
 
@@ -25,8 +25,10 @@ HEADINGS = ("material", "BSDF", "time", "compile", "variance", "HDR-FLIP", "SMAP
 DEPTH = 6
 TEXTURE_SCALE = 2.0
 STAND_IN_RUNS = 2  # of `principled`, which is only timed
+FIRST_SPP = 16  # of the pictures that come before the figures
 # FLIP that takes the last colour of the difference picture.
 FLIP_SCALE = 0.5
+Progress = Callable[[str, int], None]
 
 
 class Settings(NamedTuple):
@@ -34,9 +36,29 @@ class Settings(NamedTuple):
 
     size: tuple[int, int] = (256, 256)
     spp: int = 64
-    runs: int = 3
-    reference_spp: int = 512
+    runs: int = 2
+    reference_spp: int = 144
     adapter: str = DEFAULT_ADAPTER
+
+    @property
+    def first_spp(self) -> int:
+        """Samples per pixel of the first pictures."""
+        return min(self.spp, FIRST_SPP)
+
+
+class Scene(NamedTuple):
+    """A material's name, its label in the sheet, and its BSDFs by their names."""
+
+    material: str
+    label: str
+    bsdfs: dict[str, dict[str, Any]]
+
+
+class Frame(NamedTuple):
+    """A picture (height, width, 3), and the seconds that it took with all compilation."""
+
+    image: NDArray[np.float64]
+    seconds: float
 
 
 class Line(NamedTuple):
@@ -56,41 +78,52 @@ class Line(NamedTuple):
 
 
 def demo(
-    path: str | Path, settings: Settings, progress: Callable[[str, int], None] = lambda what, samples: None
+    path: str | Path,
+    settings: Settings,
+    progress: Progress = lambda what, samples: None,
+    published: Callable[[str], None] = lambda shown: None,
 ) -> list[Line]:
-    """Render the demonstration and write its sheet.
+    """Render the demonstration and write its sheet: at once with few samples, then anew with each scene's figures.
 
     Args:
-        path: the PNG.
+        path: the PNG; written atomically each time.
         progress: called with what is being rendered, and the samples per pixel just done.
+        published: called with what the PNG shows, whenever that is more than before.
 
     Returns:
         The lines of the table, three for each scene: `principled`, `layered`, `nma`.
     """
-    lines, rows = [], []
-    for material, label, bsdfs in _scenes(settings.adapter):
-        measured = {}
-        for name, bsdf in bsdfs.items():
-            runs = STAND_IN_RUNS if name == "principled" else settings.runs
-            measured[name] = _measure(bsdf, settings, runs, partial(progress, f"{material}, {name}"))
-        truth = _converged(bsdfs["layered"], settings, partial(progress, f"{material}, converged"))
-        added = [
-            Line(material, name, m, {} if name == "principled" else compare_images(m.mean, truth))
-            for name, m in measured.items()
-        ]
-        rows.append(_row(label, truth, added[1], added[2], settings))
+    rows: dict[str, Row] = {}
+    lines: list[Line] = []
+
+    def publish(material: str, row: Row, shown: str) -> None:
+        rows[material] = row
+        _write(path, list(rows.values()), lines, settings)
+        published(shown)
+
+    scenes, first = _scenes(settings.adapter), {}
+    for scene in scenes:
+        first[scene.material] = _first_frames(scene, settings, progress)
+        publish(
+            scene.material,
+            _early_row(scene, first[scene.material], settings),
+            f"{scene.material}, first pictures",
+        )
+    for scene in scenes:
+        truth, added = _measured(scene, first[scene.material], settings, progress)
         lines += added
-    table = [HEADINGS, *(line.cells() for line in lines)]
-    columns = ("reference: layered", "adapter: nma", "difference: FLIP")
-    title = "Layered materials, simulated and by their adapter"
-    contact_sheet(path, rows, columns, title=title, table=table, note=note(settings))
+        publish(
+            scene.material,
+            _row(scene.label, truth, added[1], added[2], settings),
+            f"{scene.material}, with figures",
+        )
     return lines
 
 
 def total_samples(settings: Settings) -> int:
     """Samples per pixel that `demo` reports to `progress` in total."""
-    frames = 2 * (settings.runs + 1) + STAND_IN_RUNS + 1
-    return 2 * (frames * settings.spp + settings.reference_spp)
+    frames = 2 * settings.runs + STAND_IN_RUNS
+    return 2 * (3 * settings.first_spp + frames * settings.spp + settings.reference_spp)
 
 
 def note(settings: Settings) -> str:
@@ -109,8 +142,8 @@ def note(settings: Settings) -> str:
     )
 
 
-def _scenes(adapter: str) -> list[tuple[str, str, dict[str, dict[str, Any]]]]:
-    """Two materials with a name and a label, each as `principled` (a stand-in), `layered` and `nma`."""
+def _scenes(adapter: str) -> list[Scene]:
+    """Two materials, each as `principled` (a stand-in), `layered` and `nma`."""
     gold = materials.load("gold-red-lacquer")
     plain = {"type": "principled", "metallic": 1.0, "roughness": 0.35}
     plain["base_color"] = {"type": "rgb", "value": list(gold.values["albedo"])}  # type: ignore[arg-type]
@@ -119,13 +152,10 @@ def _scenes(adapter: str) -> list[tuple[str, str, dict[str, dict[str, Any]]]]:
     images = {n: bitmap_texture(t, scale=TEXTURE_SCALE) for n, t in procedural_textures(512).items()}
     names = {"base_color": "albedo", "roughness": "alpha_bottom", "metallic": "sigma_t"}
     textured = {"type": "principled"} | {name: images[ours] for name, ours in names.items()}
+    title = "Silver under worn lacquer: its roughness, the pigment and its amount come from textures"
     return [
-        ("plain", gold.title, _bsdfs(plain, gold, {}, adapter)),
-        (
-            "textured",
-            "Silver under worn lacquer: its roughness, the pigment and its amount come from textures",
-            _bsdfs(textured, worn, images, adapter),
-        ),
+        Scene("plain", gold.title, _bsdfs(plain, gold, {}, adapter)),
+        Scene("textured", title, _bsdfs(textured, worn, images, adapter)),
     ]
 
 
@@ -139,29 +169,74 @@ def _bsdfs(
     }
 
 
-def _measure(
-    bsdf: dict[str, Any], settings: Settings, runs: int, progress: Callable[[int], None]
-) -> Measurement:
-    scene = load_dict(preview_scene(bsdf, size=settings.size, max_depth=DEPTH))
-    return measure(scene, settings.spp, runs, progress=lambda: progress(settings.spp))
+def _load(bsdf: dict[str, Any], settings: Settings) -> Any:
+    options: Any = {"size": settings.size, "max_depth": DEPTH, "sampler": sampler(settings.spp, 1)}
+    return load_dict(preview_scene(bsdf, **options))
 
 
-def _converged(
-    bsdf: dict[str, Any], settings: Settings, progress: Callable[[int], None]
-) -> NDArray[np.float32]:
-    """The reference, from samples of its own."""
-    scene = load_dict(preview_scene(bsdf, size=settings.size, max_depth=DEPTH))
-    return render_passes(scene, settings.reference_spp, seed=1, progress=progress)
+def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[str, Frame]:
+    """A frame of few samples by each BSDF: something to look at, and the time that compilation takes."""
+    frames = {}
+    for name, bsdf in scene.bsdfs.items():
+        frames[name] = Frame(*render_seconds(_load(bsdf, settings), settings.first_spp, settings.runs))
+        progress(f"{scene.material}, {name}", settings.first_spp)
+    return frames
+
+
+def _measured(
+    scene: Scene, first: dict[str, Frame], settings: Settings, progress: Progress
+) -> tuple[NDArray[np.float32], list[Line]]:
+    """The reference, from samples of its own, and a line for each BSDF."""
+    truth = render_passes(
+        _load(scene.bsdfs["layered"], settings),
+        settings.reference_spp,
+        seed=1,
+        progress=partial(progress, f"{scene.material}, converged"),
+    )
+    lines = []
+    for name, bsdf in scene.bsdfs.items():
+        runs = STAND_IN_RUNS if name == "principled" else settings.runs
+        step = partial(progress, f"{scene.material}, {name}", settings.spp)
+        found = measure(_load(bsdf, settings), settings.spp, runs, warmup=False, progress=step)
+        rendering = found.seconds * settings.first_spp / settings.spp
+        found = found._replace(compile_seconds=max(first[name].seconds - rendering, 0.0))
+        lines.append(
+            Line(scene.material, name, found, {} if name == "principled" else _errors(found.mean, truth))
+        )
+    return truth, lines
+
+
+def _errors(test: NDArray[np.float64], truth: NDArray[np.float32]) -> dict[str, float]:
+    flip = {f"flip_{kind}": float(flip_map(test, truth, hdr=kind == "hdr").mean()) for kind in ("hdr", "ldr")}
+    return flip | errors(test, truth)
+
+
+def _write(path: str | Path, rows: list[Row], lines: list[Line], settings: Settings) -> None:
+    columns = ("reference: layered", "adapter: nma", "difference: FLIP")
+    title = "Layered materials, simulated and by their adapter"
+    table = [HEADINGS, *(line.cells() for line in lines)] if lines else []
+    contact_sheet(path, rows, columns, title=title, table=table, note=note(settings))
+
+
+def _early_row(scene: Scene, frames: dict[str, Frame], settings: Settings) -> Row:
+    """The pictures of one scene before anything is measured."""
+    truth, adapter = (frames[name].image.astype(np.float32) for name in ("layered", "nma"))
+    text = f"{settings.first_spp} spp, figures follow"
+    return Row(scene.label, [truth, adapter, _difference(adapter, truth)], [text, text])
 
 
 def _row(label: str, truth: NDArray[np.float32], reference: Line, adapter: Line, settings: Settings) -> Row:
     """The pictures of one scene, with time, variance and error under them."""
-    difference = difference_image(adapter.measured.mean, truth, kind="flip", scale=FLIP_SCALE)
     captions = [_caption(line, settings) for line in (reference, adapter)]
     captions.append(
         f"mean {adapter.errors['flip_ldr']:.4f}, of noise alone {reference.errors['flip_ldr']:.4f}"
     )
-    return Row(label, [truth, adapter.measured.mean, difference], captions)
+    mean = adapter.measured.mean
+    return Row(label, [truth, mean, _difference(mean, truth)], captions)
+
+
+def _difference(test: NDArray, truth: NDArray) -> NDArray[np.uint8]:
+    return difference_image(test, truth, kind="flip", scale=FLIP_SCALE)
 
 
 def _caption(line: Line, settings: Settings) -> str:
