@@ -28,6 +28,7 @@ bool attempt(const std::uint8_t* data, std::size_t size) {
     try {
         const nma::Adapter adapter = nma::Adapter::from_memory(data, size);
         std::vector<float> parameters(adapter.parameter_count(), 0.5f);
+        if (!adapter.material().empty()) parameters = adapter.material();
         adapter.clamp(parameters.data());
         require(adapter.check(parameters.data()) < 0);
         const nma::Direction wi{0.5196152f, 0.6928203f, 0.5f};
