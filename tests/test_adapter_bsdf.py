@@ -368,7 +368,8 @@ def test_missing_inputs_are_named(weights):
 
 
 def test_other_variants_are_refused(weights):
-    for variant in ("scalar_spectral", "llvm_ad_spectral", "llvm_ad_mono"):
+    present = {"scalar_spectral", "llvm_ad_spectral", "llvm_ad_mono", "metal_ad_rgb"} & set(mi.variants())
+    for variant in present:
         mi.set_variant(variant)
         assert f"not in {variant}" in load_error(description(weights))
 

@@ -79,3 +79,17 @@ def test_modules_take_dr_jit_from_the_gate():
             continue
         own = re.findall(r"^(?:import|from) (?:drjit|mitsuba)\b.*", path.read_text(), re.M)
         assert not own, f"{path}: {own}; write `from nma.jit import dr`"
+
+
+@needs_llvm
+@pytest.mark.usefixtures("compiler")
+def test_the_scalar_renderer_needs_no_library():
+    code = (
+        "import nma.render; import mitsuba as mi; nma.render.use('scalar_rgb');"
+        "print(mi.load_dict({'type': 'nma', 'adapter': 'layered3-3x32', 'alpha_top': .1, 'alpha_bottom': .2,"
+        " 'eta_top': 1.5, 'eta_conductor': .2, 'k_conductor': 3., 'albedo': .5, 'sigma_t': .5}));"
+        "nma.render.use('llvm_ad_rgb')"
+    )
+    result = run(code, DRJIT_LIBLLVM_PATH="/nowhere/libLLVM.so")
+    assert "Nma[" in result.stdout
+    assert "MissingDependencyError: Dr.Jit has loaded no libLLVM; set DRJIT_LIBLLVM_PATH=" in result.stderr

@@ -10,14 +10,18 @@ They exist in the variant in use and in every one chosen later, so the order of 
 
 from __future__ import annotations
 
+import contextlib
+
 from nma import native
 from nma.errors import MissingDependencyError, ParamError
-from nma.jit import dr
 from nma.llvm import ensure_llvm
 from nma.render import register as _plugins
 
 __all__ = ["use"]
 
+# Mitsuba loads Dr.Jit, which then wants its libLLVM chosen. Where there is none, scalar_rgb and GPUs remain.
+with contextlib.suppress(MissingDependencyError):
+    ensure_llvm()
 _plugins.register()
 
 
@@ -26,13 +30,14 @@ def use(variant: str = "auto") -> str:
 
     Args:
         variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb. The
-            plugins for scalar_rgb are compiled when it is first chosen.
+            plugins for scalar_rgb are compiled when it is first chosen. Our BSDFs run in these three.
 
     Raises:
         ParamError: Mitsuba has no such variant.
         MissingDependencyError: the variant needs libLLVM, and it is missing or too old; or a C++ compiler, or an
             NVIDIA GPU.
     """
+    import drjit as dr
     import mitsuba as mi
 
     if variant == "auto":

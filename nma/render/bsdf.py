@@ -6,25 +6,15 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-from nma.errors import ParamError
 from nma.ops import Color, Vec3, minimum
 
+# Mitsuba's variants that BSDFs written in Python run in: parameters are RGB, code is vectorised.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 # Mitsuba's BSDFs that ask one other and hand on its answer.
 _HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
 # Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": powers of the inverse of this number, the
 # root of x^4 = x + 1, spread points evenly over a cube.
 _SPREAD = 1.2207440846057596
-
-
-def check_variant(variant: str, plugin: str) -> None:
-    """Refuses variants other than `VARIANTS`."""
-    if variant not in VARIANTS:
-        raise ParamError(
-            f"BSDF '{plugin}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters are RGB "
-            "and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for scalar_rgb "
-            "with `nma mitsuba build`"
-        )
 
 
 def define_base() -> type:
@@ -41,10 +31,6 @@ def define_base() -> type:
 
     class OneSided(mi.BSDF):
         inputs: Any = None
-
-        def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
-            check_variant(mi.variant(), props.plugin_name())
 
         def _declare(self, *flags: mi.BSDFFlags) -> None:
             """One component: glossy reflection on the front, with these flags besides."""
@@ -157,10 +143,12 @@ _blends: tuple[list[Any], set[int]] = [], set()
 
 def _registered() -> list[Any]:
     """All BSDFs of Mitsuba's present variant."""
-    import drjit as dr
-    import mitsuba as mi
+    import drjit
+    import mitsuba
 
-    found = []
+    dr: Any = drjit
+    mi: Any = mitsuba  # its types change with the variant
+    found: list[Any] = []
     for number in count(1):
         try:
             bsdf = dr.reinterpret_array(mi.BSDFPtr, mi.UInt32(number))[0]

@@ -159,7 +159,7 @@ class _Seen:
         import mitsuba as mi
 
         self._number = None if isinstance(value, mi.Texture) else value
-        self._params = mi.traverse(value) if self._number is None else {}
+        self._params: Any = mi.traverse(value) if self._number is None else {}
         self._names = [key for key, _ in self._params.items() if _known(key)]
         self._checked: list[Any] | None = None
 

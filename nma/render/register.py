@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+from functools import partial
 from typing import Any
 
 from nma import native
+from nma.errors import ParamError
+from nma.render.bsdf import VARIANTS
 
 # Name of the plugin, and the module whose `define()` makes its class for the present variant.
 PLUGINS = {
@@ -42,7 +45,17 @@ def _on_variant(old: str | None, new: str) -> None:
         _add_resource(str(native.mitsuba_folder()))
         return
     for name, module in PLUGINS.items():
-        mi.register_bsdf(name, importlib.import_module(module).define())
+        runs = new in VARIANTS
+        mi.register_bsdf(name, importlib.import_module(module).define() if runs else partial(_refuse, new))
+
+
+def _refuse(variant: str, props: Any) -> Any:
+    """In place of a BSDF, where a variant has none of ours."""
+    raise ParamError(
+        f"BSDF '{props.plugin_name()}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters "
+        "are RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for "
+        "scalar_rgb with `nma mitsuba build`"
+    )
 
 
 def _add_resource(folder: str) -> None:
