@@ -58,7 +58,7 @@ def info(
             console.out.print("", console.table((name, ""), [(k, _plain(v)) for k, v in value.items()]))
         else:
             console.out.print(f"[bold]{name}[/bold]: {_plain(value)}", highlight=False)
-    if "log_loss_of_last_1000_steps" in adapter.training:
+    if {"dataset", "walks_per_material"} & set(adapter.training):
         console.out.print()
         console.out.print(_ABOUT_THE_LOSS, highlight=False)
 
