@@ -1,13 +1,10 @@
 """Programs in Mitsuba's scalar renderer, whose plugins are compiled: processes that several test files start."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -51,16 +48,11 @@ def interaction(cosine, azimuth=0.0):
 """
 
 
-@contextmanager
-def own_cache(tmp_path_factory) -> Iterator[Path]:
-    """The folder of plugins that were built once for all of this run's processes, not into the user's cache."""
+def plugins() -> Path:
+    """The folder of the compiled plugins; `conftest.py` says which cache it lies in."""
     if shutil.which("c++") is None:
         pytest.skip("there is no C++ compiler here")
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(shared / "scalar-cache"))
-        yield native.build_mitsuba()
+    return native.build_mitsuba()
 
 
 def run(program: str, variant: str, *words) -> subprocess.CompletedProcess:

@@ -1,70 +1,145 @@
-"""The pages about rendering do what they say: their Python runs."""
+"""The pages do what they say: their Python runs, block by block, and what they link to is there."""
 
 import re
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from adapter_cases import random_adapter
 
-from nma import encoding, network
 from nma.adapter import Adapter
-from nma.params import LAYERED3
-from nma.target import PRINCIPLED_PARAMS
-from nma.target.decode import output_size
+from nma.library import Library
+from nma.params import LIBRARY
 from nma.train import recipe as recipes
 
 import nma.render  # noqa: F401  # isort: skip
 import mitsuba as mi  # isort: skip
 
-DOCS = Path(__file__).parents[1] / "docs"
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/README.md"])
+# Pages whose blocks train, and blocks that others are told by a file of measurements or processes of their own.
+TRAINING = "docs/bring-your-own.md"
+MEASURED = "paper_white_rgb.bsdf"
 
 
-def blocks(page):
-    """The page's Python, block by block."""
-    return re.findall(r"^```python\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S)
-
-
-BLOCKS = blocks("mitsuba.md")
-OWN = blocks("bring-your-own.md")
-
-
-@pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_python_of_the_page_on_mitsuba_runs(number, tmp_path, monkeypatch):
-    """With a tiny network in place of the shipped one, one sample per pixel and few steps, to save time."""
-    inputs = encoding.size("layered3", LAYERED3, True)
-    layers = network.init(np.random.default_rng(0), [inputs, 8, 8, output_size(2, PRINCIPLED_PARAMS)])
-    adapter = Adapter(LAYERED3, "layered3", layers, 2, True, PRINCIPLED_PARAMS)
-    render = mi.render
-    monkeypatch.setattr(Adapter, "load", staticmethod(lambda name: adapter))
-    monkeypatch.setattr(mi, "render", lambda *args, **kwargs: render(*args, **kwargs | {"spp": 1}))
-    monkeypatch.setattr(mi.util, "write_bitmap", partial(mi.util.write_bitmap, write_async=False))
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    variant = mi.variant() or "llvm_ad_rgb"
-    try:
-        exec(BLOCKS[number].replace("range(30)", "range(2)"), names)
-    finally:
-        mi.set_variant(variant)
-    assert np.isfinite(np.array(names["image"])).all()
-
-
-@pytest.mark.parametrize("number", range(len(OWN)))
-def test_python_of_the_page_on_own_materials_runs(number, tmp_path, monkeypatch):
-    """With few steps and one sample per pixel, to save time."""
-    render = mi.render
-    for name, preset in recipes.PRESETS.items():
-        monkeypatch.setitem(
-            recipes.PRESETS, name, replace(preset, network="1x8", rows=32, steps=30, albedo=0.0)
+def blocks(language):
+    """What pages have in that language, under names such as docs/python.md-0."""
+    return {
+        f"{page.relative_to(ROOT)}-{number}": block
+        for page in PAGES
+        for number, block in enumerate(
+            re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
         )
+    }
+
+
+PYTHON = blocks("python")
+SLOW = [name for name, text in PYTHON.items() if name.startswith(TRAINING) or "Library" in text]
+
+
+@pytest.fixture
+def cheap(tmp_path, monkeypatch):
+    """A folder to work in; a tiny network in place of the shipped one, one sample per pixel, few steps."""
+    load, tiny, render = Adapter.load, random_adapter(hidden="2x8"), mi.render
+    shipped = lambda name: tiny if str(name) in nma.shipped() else load(name)
+    monkeypatch.setattr(Adapter, "load", staticmethod(shipped))
     monkeypatch.setattr(mi, "render", lambda *args, **kwargs: render(*args, **kwargs | {"spp": 1}))
     monkeypatch.setattr(mi.util, "write_bitmap", partial(mi.util.write_bitmap, write_async=False))
+    for name, preset in recipes.PRESETS.items():
+        quick = replace(preset, network="1x8", rows=32, steps=30, albedo=0.0)
+        monkeypatch.setitem(recipes.PRESETS, name, quick)
     monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    exec(OWN[number], names)
-    if "fit(" in OWN[number]:
+    variant = mi.variant() or "llvm_ad_rgb"
+    yield tmp_path
+    mi.set_variant(variant)
+
+
+def test_there_are_blocks_in_every_page_about_python():
+    pages = {name.rpartition("-")[0] for name in PYTHON}
+    assert {"README.md", "docs/mitsuba.md", "docs/python.md", "docs/materials.md", TRAINING} <= pages
+
+
+@pytest.mark.parametrize("name", [name for name in PYTHON if name not in SLOW])
+def test_python_of_the_pages_runs(name, cheap):
+    run_block(PYTHON[name], cheap)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SLOW)
+def test_python_that_trains_runs(name, cheap, request):
+    if MEASURED in PYTHON[name]:
+        shutil.copy(request.getfixturevalue("measurements") / "rgl" / MEASURED, cheap)
+    if "library.safetensors" in PYTHON[name]:
+        small_library().save(cheap / "library.safetensors")
+    names = run_block(PYTHON[name], cheap)
+    if "fit(" in PYTHON[name]:
         assert names["run"].step == 30
         assert names["adapter"].space.name == "measured"
+
+
+def run_block(text, folder):
+    """Runs it as a program would, and returns its names. Pictures are finite, files are written."""
+    text = text.replace("range(30)", "range(2)")
+    if "__main__" in text:
+        (folder / "block.py").write_text(text)
+        done = subprocess.run([sys.executable, "block.py"], capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return {}
+    names: dict = {}
+    exec(text, names)
     if "image" in names:
-        assert np.isfinite(np.array(names["image"])).all() and (tmp_path / "mine.png").is_file()
+        assert np.isfinite(np.array(names["image"])).all()
+    for written in re.findall(r'write_bitmap\("(.*?)"', text):
+        assert (folder / written).stat().st_size > 100
+    return names
+
+
+def small_library():
+    rng = np.random.default_rng(0)
+    adapter = random_adapter(name="raw", hidden="2x8", space=LIBRARY)
+    return Library(adapter, ("brass", "blue-rubber"), rng.normal(size=(2, LIBRARY.size)).astype(np.float32))
+
+
+@pytest.mark.parametrize("name", blocks("cpp"))
+def test_cpp_of_the_pages_compiles_and_runs(name, compiler, tmp_path):
+    """Its lines in `main`, after what they take as given."""
+    includes, lines = blocks("cpp")[name].split("\n\n", 1)
+    given = "float parameters[13] = {.02f, .1f, 1.5f, .1f, .4f, 1.4f, 4.f, 2.4f, 1.6f, .9f, .3f, .2f, .5f};\n"
+    given += "const nma::Direction wi{.6f, 0.f, .8f}, wo{0.f, .6f, .8f};\nconst float u0 = .1f, u1 = .2f, u2 = .3f;\n"
+    check = "return s.pdf > 0.f && v.pdf > 0.f ? 0 : 1;\n"
+    (tmp_path / "page.cpp").write_text(f"{includes}\nint main() {{\n{given}{lines}{check}}}\n")
+    command = [
+        compiler,
+        "-std=c++17",
+        f"-I{ROOT / 'runtime'}",
+        tmp_path / "page.cpp",
+        "-o",
+        tmp_path / "page",
+    ]
+    subprocess.run(command, check=True)
+    subprocess.run([tmp_path / "page"], cwd=ROOT, check=True)
+
+
+def test_links_between_pages_lead_somewhere():
+    """To files that are there, and headings that they have."""
+    broken = []
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+            path, _, heading = link.partition("#")
+            if link.startswith(("http", "mailto")):
+                continue
+            target = (page.parent / path).resolve() if path else page
+            if not target.exists() or (heading and heading not in headings(target)):
+                broken.append(f"{page.name}: {link}")
+    assert not broken
+
+
+def headings(page):
+    """The names that links call headings by: lower case, hyphens for blanks, no punctuation."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+    return [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]

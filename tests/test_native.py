@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scalar_cases import own_cache
+from scalar_cases import plugins
 
 import nma
 from nma import encoding, native, network
@@ -10,9 +10,8 @@ from nma.errors import MissingDependencyError
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with own_cache(tmp_path_factory) as folder:
-        yield folder
+def cache():
+    return plugins()
 
 
 def test_what_is_built_is_not_built_again(cache):

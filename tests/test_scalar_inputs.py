@@ -6,15 +6,14 @@ import math
 import numpy as np
 import pytest
 from adapter_cases import random_adapter
-from scalar_cases import CHECKS, MATERIAL, finished, own_cache
+from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 from nma.image_io import write_exr, write_png
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with own_cache(tmp_path_factory) as folder:
-        yield folder
+def cache():
+    return plugins()
 
 
 EDITS = """

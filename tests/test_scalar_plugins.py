@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from adapter_cases import random_anisotropic_adapter
-from scalar_cases import CHECKS, MATERIAL, finished, own_cache
+from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 TEXTURED = MATERIAL | {
     "albedo": CHECKS,
@@ -40,9 +40,8 @@ PICTURES = """
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with own_cache(tmp_path_factory) as folder:
-        yield folder
+def cache():
+    return plugins()
 
 
 def parsed(lines):

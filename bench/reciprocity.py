@@ -1,0 +1,109 @@
+"""How far adapters are from reciprocal: what a path traced from the light would see, against one from the camera.
+
+python bench/reciprocity.py [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
+
+The blend is prepared at the view direction, so that f(wi, wo) and f(wo, wi) are two functions. Without a renderer,
+both are averaged over directions drawn from the blend's own samples. For every named material:
+
+difference      mean of |f(wi, wo) - f(wo, wi)| over all pairs, weighted by both cosines, to the mean of f
+cos .9, .5, .2  brightness with the roles swapped to that without, less 1, of a surface seen at that cosine under a
+                uniform sky
+
+Writes reciprocity.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import frames
+import numpy as np
+from numpy.typing import NDArray
+
+import nma
+from nma import target
+from nma.adapter import Adapter
+from nma.ops import Vec3
+from nma.target import Blend, Plane
+
+COSINES = (0.9, 0.5, 0.2)
+
+
+class Pairs(NamedTuple):
+    """For directions wo drawn for wi, what both orders of the arguments return, divided by the density (3, n)."""
+
+    forward: NDArray
+    swapped: NDArray
+
+
+def main() -> None:
+    arguments = parse()
+    head = frames.begin()
+    adapter = Adapter.load(arguments.adapter)
+    names = nma.material_names()[: 2 if arguments.quick else None]
+    found = {name: measured(adapter, nma.load_material(name).vector(), arguments.samples) for name in names}
+    rows = [[name, *(percent(values) for values in columns.values())] for name, columns in found.items()]
+    print(frames.markdown(["% of R, G, B", "difference", *(f"cos {c}" for c in COSINES)], rows))
+    frames.write(arguments.output / "reciprocity.json", head, arguments, materials=found)
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--adapter", default="layered3-5x64")
+    parser.add_argument("--samples", type=int, default=1 << 16, help="pairs of directions of each figure")
+    parser.add_argument(
+        "--quick", action="store_true", help="few pairs of two materials, to see that it runs"
+    )
+    parser.add_argument("--output", type=Path, default=frames.OUTPUT, help="folder of the results")
+    arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.samples = 1 << 12
+    return arguments
+
+
+def percent(values: list[float]) -> str:
+    return "  ".join(f"{100 * x:+.1f}" for x in values)
+
+
+def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[float]]:
+    """The figures of a material, RGB each."""
+    rng = np.random.default_rng(0)
+    every = pairs(adapter, params, np.sqrt(rng.random(samples)), rng)
+    off = np.abs(every.forward - every.swapped).mean(axis=1) / every.forward.mean(axis=1)
+    columns = {"difference": off.tolist()}
+    for cosine in COSINES:
+        seen = pairs(adapter, params, np.full(samples, cosine), rng)
+        columns[f"cos {cosine}"] = (seen.swapped.mean(axis=1) / seen.forward.mean(axis=1) - 1.0).tolist()
+    return columns
+
+
+def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Generator) -> Pairs:
+    """Views of these cosines, and for each a direction drawn from the blend there."""
+    n = len(cosines)
+    wi = Vec3(np.sqrt(1.0 - cosines**2), np.zeros(n), cosines)
+    blend, plane = prepared(adapter, params, wi)
+    # Stratified in the number that chooses the lobe.
+    u = rng.permutation((np.arange(n) + rng.random(n)) / n), *rng.random((2, n))
+    local, value, pdf = target.sample(blend, plane.enter(wi), *u)
+    wo = plane.leave(local)
+    valid = (pdf > 0.0) & (wo.z > 1e-4)
+    wo = Vec3(*(np.where(valid, x, up) for x, up in zip(wo, (0.0, 0.0, 1.0), strict=True)))
+    other, turned = prepared(adapter, params, wo)
+    # f cos(theta_i) becomes f cos(theta_o).
+    back = np.stack(target.eval(other, turned.enter(wo), turned.enter(wi))) * wo.z / wi.z
+    weight = np.where(valid, 1.0 / np.where(valid, pdf, 1.0), 0.0)
+    return Pairs(np.stack(value) * weight, back * weight)
+
+
+def prepared(adapter: Adapter, params: NDArray, w: Vec3) -> tuple[Blend, Plane]:
+    """The blend for views along `w`, and the frame that it holds in."""
+    columns = [np.full(len(w.z), x) for x in params]
+    return adapter.prepare(columns, w.z), Plane.of(w) if adapter.in_plane else Plane()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""What `bench/reciprocity.py` measures: how far an adapter is from reciprocal."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from adapter_cases import materials, random_adapter
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "bench"))
+
+import reciprocity  # noqa: E402
+
+MATERIAL = materials(1)[0]
+
+
+def test_constant_parameters_are_reciprocal():
+    found = reciprocity.measured(random_adapter(directional=False), MATERIAL, 4000)
+    assert np.abs(list(found.values())).max() < 1e-9
+
+
+def test_both_orders_reflect_the_same_over_all_directions():
+    """By the symmetry of the integral: within four standard errors, in each of three channels."""
+    n, rng = 1 << 15, np.random.default_rng(1)
+    both = reciprocity.pairs(random_adapter(), MATERIAL, np.sqrt(rng.random(n)), rng)
+    off = both.swapped - both.forward
+    assert (np.abs(off.mean(axis=1)) < 4.0 * off.std(axis=1) / n**0.5).all()
+    # Pair by pair they differ by far more than that.
+    assert (np.abs(off).mean(axis=1) > 10.0 * np.abs(off.mean(axis=1))).all()
+
+
+def test_parameters_that_follow_the_direction_are_not():
+    found = reciprocity.measured(random_adapter(), MATERIAL, 4000)
+    assert set(found) == {"difference", *(f"cos {c}" for c in reciprocity.COSINES)}
+    assert np.min(found["difference"]) > 0.02
+    assert np.abs(found["cos 0.2"]).max() > 0.02
