@@ -30,7 +30,12 @@ def arguments(words, output):
 
 
 def _renders_nothing(monkeypatch):
-    for function in ("progressive.render_passes", "demo.render_passes", "demo.measure"):
+    for function in (
+        "progressive.render_passes",
+        "demo.render_passes",
+        "demo.measure",
+        "demo.render_seconds",
+    ):
         monkeypatch.setattr(f"nma.render.{function}", None)
 
 

@@ -92,15 +92,25 @@ def test_multijittered_samples_leave_less_noise():
     assert error["multijitter"] < 0.75 * error["independent"]
 
 
-def test_a_clamped_sample_keeps_its_colour():
-    scene = load_dict(
-        {"type": "scene", "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [8, 4, 2]}}}
-    )
-    camera = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}})
-    for limit, expected in ((2.0, [2.0, 1.0, 0.5]), (9.0, [8.0, 4.0, 2.0])):
-        integrator = clamped(mi.load_dict({"type": "path"}), limit)
-        image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=4))
-        assert image[1, 2, :3] == pytest.approx(expected, rel=1e-5)
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+def test_a_clamped_sample_keeps_its_colour(variant):
+    mi.set_variant(variant)
+    try:
+        for limit, sky, expected in (
+            (2, [8, 4, 2], [2, 1, 0.5]),
+            (9, [8, 4, 2], [8, 4, 2]),
+            (1, [0, 0, 0], [0, 0, 0]),
+        ):
+            light = {"type": "constant", "radiance": {"type": "rgb", "value": sky}}
+            film = {"type": "hdrfilm", "width": 4, "height": 4}
+            scene = mi.load_dict(
+                {"type": "scene", "sky": light, "eye": {"type": "perspective", "film": film}}
+            )
+            integrator = clamped(mi.load_dict({"type": "path"}), limit)
+            image = np.array(mi.render(scene, integrator=integrator, spp=4))
+            assert image[1, 2, :3] == pytest.approx(expected, rel=1e-5)
+    finally:
+        mi.set_variant("llvm_ad_rgb")
 
 
 def test_clamping_only_darkens_and_removes_fireflies():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from adapter_cases import random_anisotropic_adapter
 
 import nma.render
 from nma.image_io import read_image
@@ -95,15 +96,18 @@ def test_a_mesh_of_another_kind_or_axis_is_refused(wedge, tmp_path):
         mesh_shape(wedge, up="x")
 
 
-def test_textures_need_texture_coordinates(tmp_path, wedge):
+def test_textures_and_anisotropic_adapters_need_texture_coordinates(tmp_path, wedge):
     bare = tmp_path / "bare.ply"
     bare.write_text(PLY.format(3, 1, "0 0 0\n1 0 0\n0 1 1\n3 0 1 2"))
     plain = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     textured = {"type": "diffuse", "reflectance": bitmap_texture(np.full((2, 2), 0.5))}
     preview_scene(plain, mesh=bare)
     preview_scene(textured, mesh=wedge, mesh_up="y")
-    with pytest.raises(MeshError, match="no texture coordinates"):
-        preview_scene(textured, mesh=bare)
+    random_anisotropic_adapter("1x8").save(tmp_path / "anisotropic.safetensors")
+    anisotropic = {"type": "nma", "adapter": str(tmp_path / "anisotropic.safetensors")}
+    for needy in (textured, anisotropic):
+        with pytest.raises(MeshError, match="no texture coordinates"):
+            preview_scene(needy, mesh=bare)
 
 
 def test_render_shows_a_mesh_with_clamped_samples(nma, wedge, tmp_path):

@@ -30,6 +30,6 @@ def clamped(integrator: Any, limit: float) -> Any:
     class Clamped(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
             radiance, valid, channels = integrator.sample(scene, sampler, ray, medium, active)
-            return radiance * dr.minimum(1.0, limit / dr.max(radiance)), valid, channels
+            return radiance * (limit / dr.maximum(dr.max(radiance), limit)), valid, channels
 
     return Clamped(mi.Properties())
