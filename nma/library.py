@@ -61,7 +61,8 @@ class Library:
         names = adapter.training.get("names")
         with safe_open(path, framework="numpy") as f:
             codes = f.get_tensor(CODES) if CODES in f.keys() else None  # noqa: SIM118
-        if adapter.space != LIBRARY or codes is None or not isinstance(names, list):
+        named = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        if adapter.space != LIBRARY or codes is None or not named:
             raise WeightsError(
                 f"{path}: an adapter of class {adapter.space.name}, not a library; `nma train-library` makes one"
             )

@@ -194,6 +194,10 @@ def test_mistakes_are_named(library, saved, tmp_path):
     Adapter.load(saved).save(plain)
     with pytest.raises(WeightsError, match="plain.safetensors.*not a library"):
         Library.load(plain)
+    odd = {**library.adapter.training, "names": [[name] for name in NAMES]}
+    replace(library.adapter, training=odd).save(plain, {"codes": library.codes})
+    with pytest.raises(WeightsError, match="plain.safetensors.*not a library"):
+        Library.load(plain)
     with pytest.raises(WeightsError, match="must differ"):
         Library(library.adapter, ("a", "a", "b"), library.codes)
     with pytest.raises(WeightsError, match="class layered3"):

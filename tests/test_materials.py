@@ -1,8 +1,10 @@
 """Named materials, the format of their files, and the corpus of conductors."""
 
 import re
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import mitsuba as mi
@@ -381,6 +383,15 @@ def test_a_file_that_is_no_image_is_refused(write, tmp_path):
     (tmp_path / "image.png").write_text("no image")
     texture = materials.load(write("albedo = 0.5", "albedo = { texture = 'image.png' }")).values["albedo"]
     with pytest.raises(TextureError, match="image.png cannot be read"):
+        texture.read()
+
+
+def test_an_image_that_claims_too_many_pixels_is_refused_before_it_takes_memory(write, tmp_path):
+    header = struct.pack(">4sIIBBBBB", b"IHDR", 100_000, 100_000, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
+    texture = materials.load(write("albedo = 0.5", "albedo = { texture = 'bomb.png' }")).values["albedo"]
+    with pytest.raises(TextureError, match="bomb.png claims 100000 x 100000 pixels"):
         texture.read()
 
 
