@@ -386,29 +386,3 @@ def test_xml_and_named_materials(weights):
     columns = [c.numpy()[0] for c in bsdf.inputs.columns()]
     np.testing.assert_allclose([columns[0], *columns[9:12]], [0.05, 0.1, 0.2, 0.3], rtol=1e-6)
     assert bsdf.inputs.clamp
-
-
-@pytest.mark.parametrize("directional", (False, True))
-def test_light_paths_are_warned_of(tmp_path, directional):
-    """Once, and only of adapters that are not reciprocal."""
-    weights = tmp_path / "w.safetensors"
-    random_adapter(hidden="1x4", directional=directional).save(weights)
-    lines = []
-
-    class Listener(mi.Appender):
-        def append(self, level, text):
-            lines.append(text)
-
-        def log_progress(self, *args):
-            pass
-
-    logger = mi.logger()
-    listener = Listener()
-    logger.add_appender(listener)
-    try:
-        loaded = scene(description(weights), "varnish", type="ptracer")
-        for seed in range(2):
-            dr.eval(mi.render(loaded, spp=1, seed=seed))
-    finally:
-        logger.remove_appender(listener)
-    assert len([text for text in lines if "varnish" in text and "not reciprocal" in text]) == directional

@@ -50,7 +50,6 @@ def define() -> type:
             self.inputs = of_adapter(self.adapter, props)
             self._curves = self._make_curves()
             self._recorded = _Recorded()
-            self._warned = False
             flags = [mi.BSDFFlags.Anisotropic] if self.adapter.anisotropic else []
             self._declare(*flags, *([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
 
@@ -67,26 +66,47 @@ def define() -> type:
 
         def eval_pdf(self, ctx, si, wo, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return self._eval_pdf(blend, si, wo, active)
+            return self._eval_pdf(ctx, blend, si, wo, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             blend, active = self._prepare(ctx, si, active)
-            return self._sample(blend, si, sample1, sample2, active)
+            return self._sample(ctx, blend, si, sample1, sample2, active)
 
         def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
             blend, active = self._prepare(ctx, si, active)
-            found = self._eval_pdf(blend, si, wo, active)
-            return *found, *self._sample(blend, si, sample1, sample2, active)
+            found = self._eval_pdf(ctx, blend, si, wo, active)
+            return *found, *self._sample(ctx, blend, si, sample1, sample2, active)
 
-        def _eval_pdf(self, blend: Blend, si, wo, active):
+        def _eval_pdf(self, ctx, blend: Blend, si, wo, active):
             plane = self._plane(si)
             value, pdf = target.eval_pdf(blend, plane.enter(vec3(si.wi)), plane.enter(vec3(wo)))
+            if self._from_light(ctx):
+                value = self._towards_camera(si, wo, active)
             return mi.Color3f(*value) & active, pdf & active
 
-        def _sample(self, blend: Blend, si, sample1, sample2, active):
+        def _sample(self, ctx, blend: Blend, si, sample1, sample2, active):
             plane = self._plane(si)
             wo, value, pdf = target.sample(blend, plane.enter(vec3(si.wi)), sample1, sample2.x, sample2.y)
-            return self._sampled(plane.leave(wo), pdf, value * (1.0 / select(pdf > 0, pdf, 1.0)), active)
+            wo = plane.leave(wo)
+            if self._from_light(ctx):
+                value = self._towards_camera(si, mi.Vector3f(*wo), active & (pdf > 0))
+            return self._sampled(wo, pdf, value * (1.0 / select(pdf > 0, pdf, 1.0)), active)
+
+        def _from_light(self, ctx) -> bool:
+            """Whether the path came from the light, and that makes a difference."""
+            return ctx.mode == mi.TransportMode.Importance and not self.adapter.reciprocal
+
+        def _towards_camera(self, si, wo, active) -> Color:
+            """f cos(theta_o) of light that arrives along `si.wi` and goes on to the camera along `wo`.
+
+            The view is `wo` then, so the blend is prepared there: paths from the light see what those from the camera
+            do, although swapping the directions of a blend gives another value. Samples are drawn as for `si.wi`.
+            """
+            turned = mi.SurfaceInteraction3f(si)
+            turned.wi = wo
+            blend, plane = self._blend(turned, active, active & (wo.z > 0)), self._plane(turned)
+            value = target.eval(blend, plane.enter(vec3(wo)), plane.enter(vec3(si.wi)))
+            return value * (wo.z / si.wi.z)
 
         def _albedo(self, si, active) -> Color:
             blend, plane = self._blend(si, active, active), self._plane(si)
@@ -106,7 +126,6 @@ def define() -> type:
 
         def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
             """The blend at `si`, and the lanes that see the front."""
-            self._warn_of_light_paths(ctx)
             front = self._front(ctx, si, active)
             return self._blend(si, active, front), front
 
@@ -132,17 +151,6 @@ def define() -> type:
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""
             return Plane.of(vec3(si.wi)) if self.adapter.in_plane else Plane()
-
-        def _warn_of_light_paths(self, ctx) -> None:
-            """Says once that light traced from its source makes another picture, where it does."""
-            if self._warned or ctx.mode != mi.TransportMode.Importance or self.adapter.reciprocal:
-                return
-            self._warned = True
-            mi.Log(
-                mi.LogLevel.Warn,
-                f"BSDF 'nma' {self.id()}: its adapter ({self.adapter.variant}) is not reciprocal, so integrators that "
-                "trace paths from the light converge to another picture than `path`; use `path` or `prb`",
-            )
 
     return Nma
 

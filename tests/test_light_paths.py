@@ -1,0 +1,121 @@
+"""Paths from the light see the BSDF `nma` as those from the camera do, though its blends are not reciprocal."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from adapter_cases import random_adapter
+
+import nma.render
+from nma import target
+from nma.adapter import Adapter
+from nma.jit import dr
+from nma.render.scene import bitmap_texture
+
+nma.render.use("llvm_ad_rgb")
+MATERIAL = {"type": "nma", "adapter": "layered3-3x32", "material": "frosted-silver"}
+STRETCHED = {**MATERIAL, "adapter": "stretched.safetensors"}
+TEXTURED = {**STRETCHED, "sigma_t": bitmap_texture(np.full((2, 2, 1), 0.3))}
+CONSTANT = {**MATERIAL, "adapter": "constant.safetensors"}
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    nma.render.use("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("adapters")
+    random_adapter(hidden="1x8", params=target.STRETCHED_PARAMS).save(made / "stretched.safetensors")
+    random_adapter(hidden="1x8", directional=False).save(made / "constant.safetensors")
+    return made
+
+
+def context(mode):
+    made = mi.BSDFContext()
+    made.mode = mode
+    return made
+
+
+CAMERA, LIGHT = context(mi.TransportMode.Radiance), context(mi.TransportMode.Importance)
+
+
+def interaction(wi):
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
+    si.wi, si.uv = wi, mi.Point2f(0.5)
+    return si
+
+
+@pytest.mark.parametrize("material", [MATERIAL, TEXTURED, STRETCHED, CONSTANT])
+def test_values_from_the_light_are_those_from_the_camera(folder, material, monkeypatch):
+    """f itself, with view and light in their places; samples are drawn by the density that is reported for them."""
+    monkeypatch.chdir(folder)
+    bsdf, rng = mi.load_dict(material), mi.PCG32(2000)
+    drawn = lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
+    camera, light = (mi.warp.square_to_cosine_hemisphere(drawn()) for _ in range(2))
+    seen = bsdf.eval(CAMERA, interaction(camera), light) / light.z
+    found = bsdf.eval(LIGHT, interaction(light), camera) / camera.z
+    np.testing.assert_allclose(found, seen, rtol=2e-3, atol=1e-5)
+    forward = bsdf.eval(CAMERA, interaction(light), camera) / camera.z
+    differs = not Adapter.load(material["adapter"]).reciprocal
+    assert (np.abs(np.array(forward) - np.array(seen)).mean() > 0.01 * np.array(seen).mean()) == differs
+
+    bs, weight = bsdf.sample(LIGHT, interaction(light), rng.next_float32(), drawn())
+    value, pdf = bsdf.eval_pdf(LIGHT, interaction(light), bs.wo, bs.pdf > 0)
+    np.testing.assert_allclose(bs.pdf, pdf, rtol=2e-3)
+    np.testing.assert_allclose(weight * bs.pdf, value, rtol=2e-3, atol=1e-5)
+
+
+def test_light_from_behind_or_to_behind_is_none():
+    bsdf, up, down = mi.load_dict(MATERIAL), mi.Vector3f(0.6, 0.0, 0.8), mi.Vector3f(0.0, 0.6, -0.8)
+    for wi, wo in (
+        (up, down),
+        (down, up),
+        (down, down),
+        (up, mi.Vector3f(1, 0, 0)),
+        (mi.Vector3f(1, 0, 0), up),
+    ):
+        assert dr.all(bsdf.eval(LIGHT, interaction(wi), wo) == 0)
+
+
+def scene(integrator):
+    """A plate under a small lamp near its horizon, seen from above: each of few pixels holds much of the light."""
+    look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": 3},
+            "sensor": {
+                "type": "perspective",
+                "fov": 28,
+                "to_world": look,
+                "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+            },
+            "lamp": {
+                "type": "sphere",
+                "center": [3.0, 0.0, 0.9],
+                "radius": 0.3,
+                "emitter": {"type": "area", "radiance": 50.0},
+            },
+            "plate": {"type": "rectangle", "bsdf": MATERIAL},
+        }
+    )
+
+
+def mean(integrator, spp, runs=8):
+    """Of the picture, RGB, and its standard error over independent runs."""
+    loaded = scene(integrator)
+    each = [np.array(mi.render(loaded, spp=spp, seed=k)).mean(axis=(0, 1)) for k in range(runs)]
+    return np.mean(each, axis=0), np.std(each, axis=0, ddof=1) / runs**0.5
+
+
+def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
+    """Means within 4.5 standard errors, of seven degrees of freedom: a false alarm in some hundred."""
+    wanted, doubt = mean("path", 1024)
+    found, error = mean("ptracer", 16384)
+    assert (error < 0.01 * wanted).all()
+    assert (np.abs(found - wanted) < 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
+    # Prepared at the light's side, as they were once, they are told apart.
+    monkeypatch.setattr(Adapter, "reciprocal", True)
+    found, error = mean("ptracer", 16384)
+    assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
