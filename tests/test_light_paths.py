@@ -1,9 +1,13 @@
 """Paths from the light see the BSDF `nma` as those from the camera do, though its blends are not reciprocal."""
 
+import json
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from adapter_cases import random_adapter
+from scalar_cases import MATERIAL as NUMBERS
+from scalar_cases import finished, plugins
 
 import nma.render
 from nma import target
@@ -15,6 +19,7 @@ nma.render.use("llvm_ad_rgb")
 MATERIAL = {"type": "nma", "adapter": "layered3-3x32", "material": "frosted-silver"}
 STRETCHED = {**MATERIAL, "adapter": "stretched.safetensors"}
 TEXTURED = {**STRETCHED, "sigma_t": bitmap_texture(np.full((2, 2, 1), 0.3))}
+PLAIN = {"type": "nma", **NUMBERS}
 CONSTANT = {**MATERIAL, "adapter": "constant.safetensors"}
 
 
@@ -119,3 +124,41 @@ def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
     monkeypatch.setattr(Adapter, "reciprocal", True)
     found, error = mean("ptracer", 16384)
     assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
+
+
+# Prints, for pairs of directions: f as seen from the camera, f as a path from the light finds it, and f with the
+# directions swapped; then what a sample is worth, and the value of its direction.
+SCALAR = """
+    rng = np.random.default_rng(0)
+    light = mi.BSDFContext(mi.TransportMode.Importance)
+
+    def direction():
+        z, phi = rng.uniform(0.1, 1), rng.uniform(0, 6.28)
+        return [float(np.sqrt(1 - z * z) * np.cos(phi)), float(np.sqrt(1 - z * z) * np.sin(phi)), z]
+
+    def at(wi):
+        si = interaction(1.0)
+        si.wi = wi
+        return si
+
+    for bsdf in map(mi.load_dict, words):
+        for _ in range(50):
+            a, b = direction(), direction()
+            seen = np.array(bsdf.eval(mi.BSDFContext(), at(a), b)) / b[2]
+            found = np.array(bsdf.eval(light, at(b), a)) / a[2]
+            swapped = np.array(bsdf.eval(mi.BSDFContext(), at(b), a)) / a[2]
+            sample, weight = bsdf.sample(light, at(b), rng.random(), rng.random(2).tolist())
+            value, pdf = bsdf.eval_pdf(light, at(b), sample.wo) if sample.pdf > 0 else ([0.0] * 3, 0.0)
+            print(json.dumps([[*map(float, x)] for x in (seen, found, swapped, weight * sample.pdf, value)]))
+"""
+
+
+def test_the_scalar_plugin_does_the_same(folder):
+    plugins()
+    bsdfs = [{**PLAIN, "adapter": str(folder / "stretched.safetensors")}, {**PLAIN, "online": True}]
+    rows = np.array([json.loads(line) for line in finished(SCALAR, "scalar_rgb", *bsdfs)])
+    assert rows.shape == (100, 5, 3)
+    seen, found, swapped, weighed, value = rows.transpose(1, 0, 2)
+    np.testing.assert_allclose(found, seen, rtol=5e-3, atol=1e-5)
+    np.testing.assert_allclose(weighed, value, rtol=5e-3, atol=1e-5)
+    assert np.abs(swapped - seen).mean() > 0.02 * seen.mean()

@@ -33,20 +33,20 @@ public:
 
     std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f};
-        return evaluated(prepare(si), si, wo);
+        return evaluated(context, prepare(si), si, wo);
     }
 
     std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u, const Point2f& u2, Mask) const override {
         if (hidden(context, si)) return {dr::zeros<BSDFSample3f>(), 0.0f};
-        return sampled(prepare(si), si, u, u2);
+        return sampled(context, prepare(si), si, u, u2);
     }
 
     std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Float u,
                                                                         const Point2f& u2, Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
         const nma::Material material = prepare(si);
-        const auto [value, density] = evaluated(material, si, wo);
-        const auto [drawn, weight] = sampled(material, si, u, u2);
+        const auto [value, density] = evaluated(context, material, si, wo);
+        const auto [drawn, weight] = sampled(context, material, si, u, u2);
         return {value, density, drawn, weight};
     }
 
@@ -125,12 +125,12 @@ private:
 
     nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return prepare(si).albedo(direction(si.wi)); }
 
-    static std::pair<Spectrum, Float> evaluated(const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) {
+    std::pair<Spectrum, Float> evaluated(const BSDFContext& context, const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) const {
         const nma::Value v = material.eval(direction(si.wi), direction(wo));
-        return {Spectrum(v.value.x, v.value.y, v.value.z), v.pdf};
+        return {seen(context, si, wo, v.value), v.pdf};
     }
 
-    static std::pair<BSDFSample3f, Spectrum> sampled(const nma::Material& material, const SurfaceInteraction3f& si, Float u, const Point2f& u2) {
+    std::pair<BSDFSample3f, Spectrum> sampled(const BSDFContext& context, const nma::Material& material, const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
         const nma::Sampled s = material.sample(direction(si.wi), u, u2.x(), u2.y());
         BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
         if (!(s.pdf > 0.0f)) return {drawn, 0.0f};
@@ -138,7 +138,18 @@ private:
         drawn.pdf = s.pdf;
         drawn.eta = 1.0f;
         drawn.sampled_type = +BSDFFlags::GlossyReflection;
-        return {drawn, Spectrum(s.value.x, s.value.y, s.value.z) / s.pdf};
+        return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
+    }
+
+    // The value for a path from the camera; on one from the light, the camera is towards wo, and the blend is prepared there,
+    // so that both see the same. Swapping the directions of a blend gives another value.
+    Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, const nma::Vec3<float>& value) const {
+        if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);
+        if (!(wo.z() > 0.0f)) return 0.0f;
+        SurfaceInteraction3f turned = si;
+        turned.wi = wo;
+        const nma::Vec3<float> back = prepare(turned).eval(direction(wo), direction(si.wi)).value;
+        return Spectrum(back.x, back.y, back.z) * (wo.z() / si.wi.z());
     }
 
     std::string name_;
