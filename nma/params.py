@@ -123,7 +123,7 @@ class ParamSpace:
             columns = self.slices[param.name]
             low, high = param.bounds(bounds)
             values = p[:, columns]
-            tolerance = 1e-6 * (high - low) if np.isfinite(high) else 1e-6
+            tolerance = 1e-6 * min(high - low, 10.0)
             bad = ~np.isfinite(values)
             if not clamp:
                 bad |= (values < low - tolerance) | (values > high + tolerance)
@@ -174,7 +174,9 @@ class ParamSpace:
         return out
 
 
-_INF = float("inf")
+# Where sources end, though nature does not: beyond, Fresnel's terms overflow in single precision, and walks through a
+# white medium take the square of its depth in steps, which looks like hanging.
+_MAX_INDEX, _MAX_DEPTH = 1e4, 1e3
 
 LAYERED3 = ParamSpace(
     "layered3",
@@ -183,7 +185,15 @@ LAYERED3 = ParamSpace(
         Param("alpha_bottom", "alpha_2", "log10", 1e-3, 1.0, 1e-4, 1.0, "microfacet width of the conductor"),
         Param("eta_top", "eta_1", "uniform", 1.05, 2.0, 1.0, 4.0, "refractive index of the coat"),
         Param(
-            "eta_conductor", "eta", "conductor", 0.03, 7.6, 0.0, _INF, "real part of the conductor's index", 3
+            "eta_conductor",
+            "eta",
+            "conductor",
+            0.03,
+            7.6,
+            0.0,
+            _MAX_INDEX,
+            "real part of the conductor's index",
+            3,
         ),
         Param(
             "k_conductor",
@@ -192,7 +202,7 @@ LAYERED3 = ParamSpace(
             0.0,
             9.5,
             0.0,
-            _INF,
+            _MAX_INDEX,
             "imaginary part of the conductor's index",
             3,
         ),
@@ -208,7 +218,14 @@ LAYERED3 = ParamSpace(
             3,
         ),
         Param(
-            "sigma_t", "sigma_t", "uniform", 0.0, 1.0, 0.0, _INF, "optical depth of the medium (thickness 1)"
+            "sigma_t",
+            "sigma_t",
+            "uniform",
+            0.0,
+            1.0,
+            0.0,
+            _MAX_DEPTH,
+            "optical depth of the medium (thickness 1)",
         ),
     ),
 )

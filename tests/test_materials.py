@@ -14,6 +14,7 @@ import pytest
 from nma import materials
 from nma.data import load_conductors
 from nma.errors import MaterialError, NmaError, TextureError
+from nma.microfacet import fresnel_conductor
 from nma.params import LAYERED3
 
 ROOT = Path(__file__).parents[1]
@@ -99,6 +100,22 @@ def test_parameters_can_be_changed_as_in_a_file(write, tmp_path):
 def test_a_conductor_may_be_given_by_its_index(write):
     material = materials.load(write('conductor = "Au"', "eta_conductor = [1, 2, 3]\nk_conductor = 4"))
     np.testing.assert_array_equal(material.vector()[3:9], [1, 2, 3, 4, 4, 4])
+
+
+@pytest.mark.parametrize("given", ["sigma_t = 1001", "sigma_t = 1e30", "sigma_t = 1e300"])
+def test_a_medium_through_which_walks_would_not_end_is_refused(write, given):
+    with pytest.raises(MaterialError, match=r"sigma_t .* allowed is 0 \.\. 1000"):
+        materials.load(write("sigma_t = 0.25", given))
+    assert materials.load(write("sigma_t = 0.25", "sigma_t = 1000")).vector()[-1] == 1000
+
+
+def test_a_metal_whose_reflectance_overflows_is_refused(write):
+    """From an index of about 1e10 on, single precision made it black."""
+    with pytest.raises(MaterialError, match=r"k_conductor .* allowed is 0 \.\. 10000"):
+        materials.load(write('conductor = "Au"', "eta_conductor = 1\nk_conductor = 1e10"))
+    largest = materials.load(write('conductor = "Au"', "eta_conductor = 1e4\nk_conductor = 1e4"))
+    reflectance = fresnel_conductor(np.float32(0.5), *(np.float32(x) for x in largest.vector()[[3, 6]]))
+    assert reflectance == pytest.approx(1.0, abs=1e-3)
 
 
 def test_sources_take_what_adapters_do_not_know(write):

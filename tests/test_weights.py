@@ -13,10 +13,10 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 from nma import adapter as adapters
-from nma import target
+from nma import target, weights
 from nma.adapter import Adapter
 from nma.errors import WeightsError
-from nma.params import LAYERED3
+from nma.params import LAYERED3, ParamSpace
 
 
 @pytest.fixture
@@ -86,7 +86,9 @@ def test_the_file_describes_itself(path):
         "description": LAYERED3["alpha_top"].description,
         "size": 1,
     }
-    assert header["parameters"][-1]["valid_high"] is None
+    assert header["parameters"][-1]["valid_high"] == 1e3
+    unbounded = ParamSpace("open", (replace(LAYERED3["sigma_t"], valid_high=float("inf")),))
+    assert weights.describe(unbounded)[0]["valid_high"] is None  # JSON has no infinity
     assert header["hidden"] == [32, 32, 32]
     assert (header["instances"], header["directional"], header["reciprocal"]) == (2, True, False)
     assert header["dialect"] == "mitsuba-principled-reflection"

@@ -12,10 +12,10 @@ inline std::vector<SourceParam> layered3_parameters() {
         {"alpha_top", 1, true, 0.0001, 1.0, 0.0f, 1.0f},
         {"alpha_bottom", 1, true, 0.0001, 1.0, 0.0f, 1.0f},
         {"eta_top", 1, false, 1.0, 4.0, 0.0f, 1.0f},
-        {"eta_conductor", 3, false, 0.0, 1e+30, 0.0f, 1.0f},
-        {"k_conductor", 3, false, 0.0, 1e+30, 0.0f, 1.0f},
+        {"eta_conductor", 3, false, 0.0, 10000.0, 0.0f, 1.0f},
+        {"k_conductor", 3, false, 0.0, 10000.0, 0.0f, 1.0f},
         {"albedo", 3, false, 0.0, 1.0, 0.0f, 1.0f},
-        {"sigma_t", 1, false, 0.0, 1e+30, 0.0f, 1.0f}};
+        {"sigma_t", 1, false, 0.0, 1000.0, 0.0f, 1.0f}};
 }
 
 }  // namespace nma
