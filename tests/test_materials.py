@@ -333,6 +333,17 @@ def test_a_coloured_image_for_one_number_is_refused_unless_a_channel_is_chosen(w
     np.testing.assert_allclose(texture.read()[..., 0], PACKED[..., 1] / 255, atol=1e-6)
 
 
+@pytest.mark.parametrize("pixels", [PACKED[..., 1:2], PACKED[..., 1::2]], ids=["grey", "grey and alpha"])
+def test_grey_images_have_every_colour_s_channel(write, tmp_path, pixels):
+    path = write_image(tmp_path / "grey.png", pixels.copy())
+    assert materials.load(write()).changed({"albedo": {"texture": str(path)}}).textures[
+        "albedo"
+    ].read().shape == (1, 2, 3)
+    for choice in ({}, {"channel": "r"}, {"channel": "b"}):
+        changed = materials.load(write()).changed({"sigma_t": {"texture": str(path), **choice}})
+        np.testing.assert_allclose(changed.textures["sigma_t"].read(), pixels[..., :1] / 255, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

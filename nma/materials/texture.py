@@ -58,7 +58,6 @@ class Texture:
 
     def _pixels(self) -> NDArray[np.float32]:
         """The image (height, width, size), linear unless `raw`, grey where `size` is 1."""
-        import mitsuba as mi
 
         bitmap = _bitmap(self.path)
         if self.channel == "a" and "A" not in [field.name for field in bitmap.struct_()]:
@@ -67,16 +66,33 @@ class Texture:
             )
         if self.raw:
             bitmap.set_srgb_gamma(False)
-        rgba = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, srgb_gamma=False))
-        if self.parameter.size == 3:
-            return rgba[..., :3]
-        if self.channel is None and _is_coloured(rgba[..., :3]):
+        pixels = _converted(bitmap, self._format(bitmap.pixel_format()))
+        if self.parameter.size == 3 or pixels.shape[2] == 1:
+            return pixels
+        if self.channel is None and _is_coloured(pixels):
             raise TextureError(
                 f"texture {self.path} is coloured, {self.parameter.name} is one number: "
                 f"choose a channel, {{ texture = '{self.path.name}', channel = 'g' }} ('r', 'g', 'b' or 'a')"
             )
         first = CHANNELS.index(self.channel or "r")
-        return rgba[..., first : first + 1]
+        return pixels[..., first : first + 1]
+
+    def _format(self, own: Any) -> Any:
+        """What to convert pixels to: no more channels than are looked at, as images may be large."""
+        import mitsuba as mi
+
+        formats: Any = mi.Bitmap.PixelFormat
+        if self.channel == "a":
+            return formats.RGBA
+        return formats.Y if self.parameter.size == 1 and own in (formats.Y, formats.YA) else formats.RGB
+
+
+def _converted(bitmap: Any, pixel_format: Any) -> NDArray[np.float32]:
+    """The pixels (height, width, channels), made linear where they are sRGB."""
+    import mitsuba as mi
+
+    array = np.array(bitmap.convert(pixel_format, mi.Struct.Type.Float32, srgb_gamma=False))
+    return array.reshape(*array.shape[:2], -1)
 
 
 def _bitmap(path: Path) -> Any:
