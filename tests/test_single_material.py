@@ -1,5 +1,6 @@
 """An adapter of one material of a class knows which: it needs no parameters, and refuses those of another."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from nma import materials
 from nma.adapter import Adapter
 from nma.errors import ParamError, WeightsError
 from nma.image_io import read_image
+from nma.params import MEASURED
 from nma.render.load import SceneError, load_dict, material_bsdf
 from nma.render.scene import bitmap_texture
 from nma.sources.adapter import AdapterValues
@@ -134,3 +136,15 @@ def test_nma_render_wants_a_material_for_the_adapter_of_a_class(nma, tmp_path):
     code, _, err = nma("render", tmp_path / "class.safetensors", "-o", tmp_path / "no.exr")
     assert code == 1
     assert "adapter of the whole class layered3; name a material, too: nma render MATERIAL --adapter" in err
+
+
+def test_nma_compare_renders_the_simulation_of_the_material_that_an_adapter_knows(nma, weights, tmp_path):
+    options = ("--size", "16", "--spp", "2", "--json")
+    alone = nma("compare", weights, *options)
+    assert alone[0] == 0, alone[2]
+    assert json.loads(alone[1]) == json.loads(
+        nma("compare", "gold-red-lacquer", "--adapter", weights, *options)[1]
+    )
+    random_adapter(hidden="1x8", name="direction", space=MEASURED).save(tmp_path / "measured.safetensors")
+    code, _, err = nma("compare", tmp_path / "measured.safetensors", *options)
+    assert code == 1 and "cannot be simulated" in err

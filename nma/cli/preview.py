@@ -62,6 +62,8 @@ def read_material(name: str, changes: list[str] | None) -> Material:
                 f"{name} is an adapter of the whole class {adapter.space.name}; "
                 f"name a material, too: nma render MATERIAL --adapter {name}"
             )
+        if adapter.material is not None:
+            return materials.Material.of_vector(Path(name).stem, adapter.material, adapter.space)
         return materials.Material(Path(name).stem, name, "", MEASURED.name, {})
     material = materials.load(name)
     return material.changed(dict(map(read_change, changes)), "--set") if changes else material

@@ -142,7 +142,9 @@ def render(
 
 def compare(
     context: typer.Context,
-    test: Annotated[str, typer.Argument(help="An image (EXR, PNG, ...), or alone: a material.")],
+    test: Annotated[
+        str, typer.Argument(help="An image (EXR, PNG, ...), or alone: a material, or the adapter of one.")
+    ],
     reference: Annotated[str | None, typer.Argument(help="The image to compare with.")] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
@@ -183,7 +185,15 @@ def compare(
         _refuse_unused(context)
         image_metrics.check_size(_pixels(size))
         view = View(_pixels(size), spp, depth, camera, lighting, envmap, variant)
-        pictures = _renderings(read_material(test, changes), view, seed, adapter, clamp)
+        if test.endswith(".safetensors"):
+            _refuse(context, ("adapter", "changes"), "an adapter")
+            adapter = test
+        material = read_material(test, changes)
+        if not material.values:
+            raise ParamError(
+                f"{test} knows a material that cannot be simulated; render both and compare the images"
+            )
+        pictures = _renderings(material, view, seed, adapter, clamp)
     truth = pictures.pop("reference")
     errors = {
         name: image_metrics.compare_images(picture, truth, ldr_exposure=exposure)
