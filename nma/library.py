@@ -61,8 +61,9 @@ class Library:
         names = adapter.training.get("names")
         with safe_open(path, framework="numpy") as f:
             codes = f.get_tensor(CODES) if CODES in f.keys() else None  # noqa: SIM118
-        named = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        if adapter.space != LIBRARY or codes is None or not named:
+        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            names = None
+        if adapter.space != LIBRARY or codes is None or names is None:
             raise WeightsError(
                 f"{path}: an adapter of class {adapter.space.name}, not a library; `nma train-library` makes one"
             )
