@@ -83,6 +83,11 @@ def test_multijittered_samples_are_taken_where_they_fill_a_grid(spp, pixels, cap
     assert capfd.readouterr().out == ""
 
 
+def test_nearly_all_numbers_of_samples_can_be_multijittered():
+    kinds = [sampler(spp, 512 * 512) for spp in range(1, 513)]
+    assert kinds.count("multijitter") > 500
+
+
 def test_multijittered_samples_leave_less_noise():
     converged = render("studio", 1024, size=32, seed=1, bsdf=GREY)
     error = {

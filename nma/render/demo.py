@@ -148,8 +148,7 @@ def _scenes(adapter: str) -> list[Scene]:
     plain = {"type": "principled", "metallic": 1.0, "roughness": 0.35}
     plain["base_color"] = {"type": "rgb", "value": list(gold.values["albedo"])}  # type: ignore[arg-type]
 
-    worn = materials.load("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
-    images = {n: bitmap_texture(t, scale=TEXTURE_SCALE) for n, t in procedural_textures(512).items()}
+    worn, images = worn_silver()
     names = {"base_color": "albedo", "roughness": "alpha_bottom", "metallic": "sigma_t"}
     textured = {"type": "principled"} | {name: images[ours] for name, ours in names.items()}
     title = "Silver under worn lacquer: its roughness, the pigment and its amount come from textures"
@@ -157,6 +156,13 @@ def _scenes(adapter: str) -> list[Scene]:
         Scene("plain", gold.title, _bsdfs(plain, gold, {}, adapter)),
         Scene("textured", title, _bsdfs(textured, worn, images, adapter)),
     ]
+
+
+def worn_silver() -> tuple[Material, dict[str, Any]]:
+    """Silver under worn lacquer, and Mitsuba's textures for some of its parameters."""
+    material = materials.load("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
+    textures = procedural_textures(512).items()
+    return material, {name: bitmap_texture(values, scale=TEXTURE_SCALE) for name, values in textures}
 
 
 def _bsdfs(

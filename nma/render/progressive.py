@@ -13,8 +13,9 @@ from nma.errors import ParamError, one_line
 from nma.image_size import MOST_PIXELS
 from nma.render.load import SceneError
 
-# Samples of one pass over the whole picture: a second or so on two cores, and a bound on memory.
-SAMPLES_PER_PASS = 1 << 20
+# Samples of one pass over the whole picture: a few seconds on two cores, and a bound on memory. A pixel of 512 x 512 has 16
+# of them: the more are laid out together, the less noise they leave.
+SAMPLES_PER_PASS = 1 << 22
 
 
 def render_passes(
@@ -71,17 +72,22 @@ def check_size(size: tuple[int, int]) -> None:
 
 
 def pass_sizes(spp: int, pixels: int) -> list[int]:
-    """Samples per pixel of each pass, as equal as can be without a third size: every size compiles anew."""
+    """Samples per pixel of each pass: equal but for the last, and such that they fill grids where that can be."""
     most = max(SAMPLES_PER_PASS // pixels, 1)
-    passes = -(-spp // most)
-    each = -(-spp // passes)
+    equal = -(-spp // -(-spp // most))
+    filling = (n for n in range(equal, equal // 2, -1) if _fills_grid(n) and _fills_grid(spp % n))
+    each = next(filling, equal)
     return [each] * (spp // each) + ([spp % each] if spp % each else [])
 
 
 def sampler(spp: int, pixels: int) -> str:
     """Mitsuba's sampler that leaves the least noise: multi-jittered where all passes fill a grid, as it demands."""
-    filled = all(samples % math.isqrt(samples) == 0 for samples in pass_sizes(spp, pixels))
-    return "multijitter" if filled else "independent"
+    return "multijitter" if all(map(_fills_grid, pass_sizes(spp, pixels))) else "independent"
+
+
+def _fills_grid(samples: int) -> bool:
+    """Whether Mitsuba's multi-jittered sampler takes this number as it is; it rounds others up."""
+    return samples % max(math.isqrt(samples), 1) == 0
 
 
 def _pass_seed(seed: int, number: int) -> int:
