@@ -85,7 +85,7 @@ def test_multijittered_samples_are_taken_where_they_fill_a_grid(spp, pixels, cap
 
 def test_nearly_all_numbers_of_samples_can_be_multijittered():
     kinds = [sampler(spp, 512 * 512) for spp in range(1, 513)]
-    assert kinds.count("multijitter") > 500
+    assert kinds.count("multijitter") > 490
 
 
 def test_multijittered_samples_leave_less_noise():

@@ -13,8 +13,8 @@ from nma.errors import ParamError, one_line
 from nma.image_size import MOST_PIXELS
 from nma.render.load import SceneError
 
-# Samples of one pass over the whole picture: a few seconds on two cores, and a bound on memory. A pixel of 512 x 512 has 16
-# of them: the more are laid out together, the less noise they leave.
+# Samples of one pass over the whole picture: a few seconds on two cores, and a bound on memory. A pixel of 512 x 512
+# has 16 of them: the more are laid out together, the less noise they leave.
 SAMPLES_PER_PASS = 1 << 22
 
 

@@ -1,0 +1,181 @@
+"""The named materials in the preview scene, its two lightings side by side, and the noise that each leaves.
+
+    python figures/gallery/run.py [--quick] [--adapter FILE]
+
+Writes gallery.png, every named material and one with textures; lighting.png, six materials by either lighting; and
+gallery.json, the noise of six pictures of 128 samples per pixel, as `nma render` made them before there was a studio,
+makes them now, and with samples clamped. With --quick, two materials, small and with few samples, to
+out/figures/gallery.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+import nma
+import nma.render
+from nma import materials
+from nma.contact_sheet import PAPER, Row, contact_sheet
+from nma.image_metrics import errors
+from nma.render.clamp import clamped
+from nma.render.demo import worn_silver
+from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
+from nma.render.progressive import render_passes, sampler
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+Image = NDArray[np.float32]
+COLUMNS = 5
+# A pair of colour and metal, two wet metals, two paints, and one that scatters.
+SIX = (
+    "gold-red-lacquer",
+    "wet-nickel",
+    "car-paint-blue",
+    "candy-apple-red",
+    "smoked-chrome",
+    "frosted-silver",
+)
+CLAMP = 5.0
+FIREFLY, VISIBLE = 5.0, 0.02  # times brighter than the median of its neighbours, and by so much at least
+
+
+class Effort(NamedTuple):
+    """Pixels on a side and samples per pixel of the sheets' pictures, of those whose noise is measured, and of theirs
+    that are converged."""
+
+    size: int = 208
+    spp: int = 256
+    noise_size: int = 128
+    noise_spp: int = 128
+    reference_spp: int = 1024
+
+
+class Way(NamedTuple):
+    """How pictures are made whose noise is measured."""
+
+    lighting: str
+    sampler: str
+    clamp: float | None = None
+
+
+WAYS = {
+    "before": Way("outdoors", "independent"),
+    "outdoors": Way("outdoors", "multijitter"),
+    "outdoors, clamped": Way("outdoors", "multijitter", CLAMP),
+    "studio": Way("studio", "multijitter"),
+    "studio, clamped": Way("studio", "multijitter", CLAMP),
+}
+
+
+def main() -> None:
+    parser = common.parser(__doc__)
+    parser.add_argument("--adapter", default=DEFAULT_ADAPTER, help="a weights file or a shipped name")
+    arguments = parser.parse_args()
+    effort = Effort(32, 16, 32, 16, 64) if arguments.quick else Effort()
+    nma.render.use()
+    folder = common.results(__file__, arguments.quick)
+    names = materials.names()[:2] if arguments.quick else materials.names()
+    shown = {materials.load(name).title: named(name, arguments.adapter) for name in names}
+    shown["Silver under worn lacquer, textured"] = textured(arguments.adapter)
+    gallery(shown, effort, folder / "gallery.png")
+    six = {name: named(name, arguments.adapter) for name in (names if arguments.quick else SIX)}
+    lightings(six, effort, folder / "lighting.png")
+    found = {name: noise(name, bsdf, effort) for name, bsdf in six.items()}
+    about = {"adapter": Path(arguments.adapter).stem, **effort._asdict(), "clamp": CLAMP}
+    common.write_json(folder / "gallery.json", about | {"materials": found})
+
+
+def named(name: str, adapter: str) -> dict[str, Any]:
+    return material_bsdf(materials.load(name), "nma", adapter=adapter)
+
+
+def textured(adapter: str) -> dict[str, Any]:
+    silver, images = worn_silver()
+    return material_bsdf(silver, "nma", adapter=adapter) | images
+
+
+def render(bsdf: dict[str, Any], size: int, spp: int, way: Way, seed: int = 0) -> Image:
+    """A picture of the ball."""
+    options = {"size": (size, size), "lighting": way.lighting, "sampler": way.sampler}
+    scene = load_dict(nma.preview_scene(bsdf, **options))
+    integrator = clamped(scene.integrator(), way.clamp) if way.clamp else None
+    return render_passes(scene, spp, seed=seed, integrator=integrator)
+
+
+def gallery(shown: dict[str, dict[str, Any]], effort: Effort, path: Path) -> None:
+    """One picture of each, in rows."""
+    size, spp = effort.size, effort.spp
+    way = Way("studio", sampler(spp, size * size))
+    pictures: list[NDArray] = [render(bsdf, size, spp, way) for bsdf in shown.values()]
+    titles = list(shown)
+    while len(pictures) % COLUMNS:
+        pictures.append(np.full((size, size, 3), PAPER, np.uint8))
+        titles.append("")
+    rows = [
+        Row("", pictures[n : n + COLUMNS], [wrapped(title) for title in titles[n : n + COLUMNS]])
+        for n in range(0, len(pictures), COLUMNS)
+    ]
+    contact_sheet(path, rows, [""] * COLUMNS)
+    print(path)
+
+
+def wrapped(title: str, width: int = 28) -> str:
+    """At most two lines, parted at a word."""
+    if len(title) <= width:
+        return title
+    cut = title.rindex(" ", 0, width)
+    return f"{title[:cut]}\n{title[cut + 1 :]}"
+
+
+def lightings(six: dict[str, dict[str, Any]], effort: Effort, path: Path) -> None:
+    """The former light above the studio."""
+    size, spp = effort.size, effort.spp
+    kind = sampler(spp, size * size)
+    rows = [
+        Row(label, [render(bsdf, size, spp, Way(lighting, kind)) for bsdf in six.values()])
+        for label, lighting in (("--lighting outdoors", "outdoors"), ("--lighting studio", "studio"))
+    ]
+    contact_sheet(path, rows, list(six))
+    print(path)
+
+
+def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str, float]]:
+    """What each way leaves: relative RMSE, fireflies, processor seconds, and the brightness that clamping takes."""
+    lightings = dict.fromkeys(way.lighting for way in WAYS.values())
+    references = {
+        lighting: render(bsdf, effort.noise_size, effort.reference_spp, Way(lighting, "multijitter"), seed=1)
+        for lighting in lightings
+    }
+    found = {}
+    for label, way in WAYS.items():
+        converged = references[way.lighting]
+        render(bsdf, effort.noise_size, 1, way)  # compiles
+        began = time.process_time()
+        picture = render(bsdf, effort.noise_size, effort.noise_spp, way, seed=2)
+        found[label] = {
+            "relative_rmse": round(float(np.sqrt(errors(picture, converged)["mrse"])), 4),
+            "fireflies": int((fireflies(picture) & ~fireflies(converged)).sum()),
+            "processor_seconds": round(time.process_time() - began, 2),
+            "brightness": round(float(picture.mean() / converged.mean()), 4),
+        }
+        print(f"{name}, {label}: {found[label]}", flush=True)
+    return found
+
+
+def fireflies(image: Image) -> NDArray[np.bool_]:
+    """Pixels (height, width) that are visibly brighter than the median of their 3 x 3 neighbourhood."""
+    brightness = np.pad(image.mean(axis=2), 1, mode="edge")
+    around = np.median(sliding_window_view(brightness, (3, 3)), axis=(2, 3))
+    return brightness[1:-1, 1:-1] > np.maximum(FIREFLY * around, around + VISIBLE)
+
+
+if __name__ == "__main__":
+    main()
