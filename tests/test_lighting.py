@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import nma.render
+from nma.cli.preview import View
 from nma.errors import ParamError
+from nma.materials import load as load_material
 from nma.render.clamp import clamped
 from nma.render.lighting import LIGHTINGS, SOFTBOXES, sky_directions, sky_radiance, studio_radiance
 from nma.render.load import load_dict
@@ -81,6 +83,14 @@ def test_multijittered_samples_are_taken_where_they_fill_a_grid(spp, pixels, cap
         taken = mi.load_dict({"type": kind, "sample_count": samples}).sample_count()
         assert taken == samples
     assert capfd.readouterr().out == ""
+
+
+def test_the_command_asks_for_no_number_that_mitsuba_warns_of(capfd):
+    """128 samples are no grid, two passes of 64 are."""
+    view = View((192, 192), 128, 6, "hero", "studio", None, "llvm_ad_rgb")
+    assert sampler(128, 192 * 192) == "multijitter"
+    view.load(load_material("wet-nickel"), "layered")
+    assert "WARN" not in "".join(capfd.readouterr())
 
 
 def test_nearly_all_numbers_of_samples_can_be_multijittered():

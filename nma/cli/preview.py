@@ -35,8 +35,10 @@ class View(NamedTuple):
         bsdf = load.material_bsdf(material, model, adapter=adapter, clamp=clamp)
         options: dict[str, Any] = {"camera": self.camera, "lighting": self.lighting, "envmap": self.envmap}
         options |= {"mesh": self.mesh, "mesh_up": self.mesh_up, "max_depth": self.depth}
-        options["sampler"] = progressive.sampler(self.spp, self.size[0] * self.size[1])
-        return load.load_dict(scene.preview_scene(bsdf, size=self.size, spp=self.spp, **options))
+        pixels = self.size[0] * self.size[1]
+        options |= {"sampler": progressive.sampler(self.spp, pixels), "size": self.size}
+        options["spp"] = progressive.pass_sizes(self.spp, pixels)[0]
+        return load.load_dict(scene.preview_scene(bsdf, **options))
 
 
 def use_rgb(variant: str) -> None:
