@@ -101,9 +101,9 @@ python=$(find_python)
 if [ -n "${DRJIT_LIBLLVM_PATH:-}" ]; then
     fault=$("$python" -I nma/llvm.py) || die "DRJIT_LIBLLVM_PATH: $fault; unset it"
 fi
-# The system's packages arrive while pip works, where pip can do without them.
+# Where we may install the system's packages, they arrive while pip works, unless pip needs them.
 apt=
-if "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+if [ "$(id -u)" = 0 ] && "$python" -c 'import ensurepip, venv' 2>/dev/null; then
     install_system &
     apt=$!
 else
@@ -111,4 +111,4 @@ else
 fi
 make_venv
 install_package "$goal" "$extra"
-[ -z "$apt" ] || wait "$apt"
+[ -z "$apt" ] || wait "$apt" || die "the system's packages are missing, see above"
