@@ -6,6 +6,7 @@ import argparse
 import fcntl
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,6 +21,8 @@ from nma.metrics import table_metrics
 
 ROOT = Path(__file__).parent.parent
 REFERENCES = ROOT / "out/references"
+# Measured materials, which are no part of this repository.
+DATA = Path(os.environ.get("NMA_TEST_DATA") or ROOT.parent / "shared/data")
 # The sets of unseen materials: (materials, population, seed).
 SETS = {"range": (89, "range", 89), "metals": (60, "unseen_metals", 60)}
 REFERENCE_WALKS = 64_000_000

@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = sorted(script.parent.name for script in (ROOT / "figures").glob("*/run.py"))
 
+NEED_DATA = {"library"}
 # Their quick forms train so little that compiling takes longest.
 FEW_STEPS = {"library", "measured"}
 FAST_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
@@ -25,7 +26,9 @@ def figures(*words):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_quick(name):
+def test_quick(name, request):
+    if name in NEED_DATA:
+        request.getfixturevalue("measurements")
     folder = ROOT / "out/figures" / name
     for old in [*folder.glob("*.json"), *folder.glob("*.png")]:
         old.unlink()

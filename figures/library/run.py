@@ -38,7 +38,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
 import studio
 
-DATA = common.ROOT.parent / "shared/data"
+DATA = common.DATA
 NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"
 NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
 # Top left, top right, bottom left, bottom right: a metal, a paint, a matte material and a plastic.

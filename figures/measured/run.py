@@ -45,7 +45,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
 import studio
 
-DATA = common.ROOT.parent / "shared/data"
+DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")
 # What was published of NBRDF holds without the grazing directions in which measurements are hardest to follow.
 RANGES = {"": (0.02, 1.0), " from .05": (0.05, 1.0)}
