@@ -12,7 +12,9 @@ from nma import cli, llvm
 
 # What is compiled is kept apart from the user's cache, and shared by all workers, programs and runs of the tests:
 # folders in it are named by the digest of what they were made from.
-os.environ["XDG_CACHE_HOME"] = str(Path(__file__).parents[1] / "build/tests")
+CACHE = Path(__file__).parents[1] / "build/tests"
+os.environ["XDG_CACHE_HOME"] = str(CACHE)
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "jax")
 
 
 @pytest.fixture
