@@ -141,6 +141,7 @@ def test_render_knows_the_bsdfs_in_a_scene_file(nma, weights, tmp_path, bsdf):
     assert read_image(tmp_path / "b.exr").shape == (12, 12, 3)
 
 
+@pytest.mark.slow
 def test_a_bsdf_is_fitted_and_rendered(nma, tmp_path):
     bsdf, fit = tmp_path / "matte.xml", tmp_path / "matte.safetensors"
     bsdf.write_text('<bsdf version="3.0.0" type="diffuse"/>')

@@ -105,14 +105,19 @@ def slopes(loaded, directions, step, spp, seeds):
     return {key: np.array(value) for key, value in derivatives.items()}, differences
 
 
+def case(name, folder):
+    """A case by its name; where the network runs at shading points, with small weights that have clear slopes."""
+    bsdf, directions = CASES[name]
+    if name == "textured":
+        random_adapter(hidden="2x8", seed=5).save(folder / "small.safetensors")
+        bsdf = bsdf | {"adapter": str(folder / "small.safetensors")}
+    return bsdf, directions
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
     """With one point light nothing is random but the place in the pixel, the same on all sides."""
-    bsdf, directions = CASES[name]
-    if name == "textured":
-        # Any weights will do, and small ones compile fast.
-        random_adapter(hidden="2x8").save(tmp_path / "small.safetensors")
-        bsdf = bsdf | {"adapter": str(tmp_path / "small.safetensors")}
+    bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}
     derivatives, differences = slopes(scene(bsdf, depth=2, sky=0.0), directions, 0.001, spp=16, seeds=2)
     for key, expected in differences.items():
@@ -121,9 +126,9 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_gradients_of_all_light_are_finite_differences(name):
+def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
     """Sampling makes both noisy: four standard errors over 8 seeds (false alarm .007 in all, by Student's t)."""
-    bsdf, directions = CASES[name]
+    bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}
     derivatives, differences = slopes(scene(bsdf, depth=4, sky=0.5), directions, 0.01, spp=128, seeds=8)
     for key, expected in differences.items():
@@ -134,6 +139,7 @@ def test_gradients_of_all_light_are_finite_differences(name):
         assert error < 0.1 * abs(expected.mean()), key
 
 
+@pytest.mark.slow
 def test_optimisation_finds_a_texture():
     """A sheet under a uniform sky, seen from above; texels are known to .02 on average and .08 at worst."""
     wanted = np.random.default_rng(2).uniform(0.1, 0.9, (3, 3, 3))

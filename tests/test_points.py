@@ -106,7 +106,11 @@ def test_an_anisotropic_fit_knows_azimuths(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "grid", (Grid(10, 10, 10), Grid(8, 8, 16, phi_i=8)), ids=("isotropic", "anisotropic")
+    "grid",
+    [
+        pytest.param(Grid(10, 10, 10), id="isotropic"),
+        pytest.param(Grid(8, 8, 16, phi_i=8), id="anisotropic", marks=pytest.mark.slow),
+    ],
 )
 def test_tables_are_fitted_bin_by_bin(grid):
     """Tables without parameters, of any resolution."""
