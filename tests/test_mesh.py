@@ -78,6 +78,10 @@ def test_a_flat_mesh_lies_above_the_floor(tmp_path):
         (PLY.format(3, 0, "0 0 0\n1 0 0\n0 1 0"), "empty"),
         (PLY.format(3, 1, "0 0 0\nnan 0 0\n0 1 0\n3 0 1 2"), "NaN or infinite|cannot be read"),
         (PLY.format(3, 1, "1 2 3\n1 2 3\n1 2 3\n3 0 1 2"), "no extent"),
+        (
+            PLY.format(3, 2, "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 1 99"),
+            "triangle 1 has the vertex 99, but there are 3",
+        ),
     ],
 )
 def test_a_mesh_that_cannot_be_shown_is_refused(tmp_path, text, message):

@@ -120,6 +120,15 @@ def test_files_that_make_no_sense_are_refused(tmp_path, data, message):
 
 
 @pytest.mark.usefixtures("compiler")
+def test_a_folder_is_no_weights_file(tmp_path):
+    """It opens as a file does; reading it threw what is no `nma::Error`."""
+    with pytest.raises(
+        WeightsError, match=re.escape(f"{tmp_path}: no such weights file, or it cannot be read")
+    ):
+        Runtime(tmp_path)
+
+
+@pytest.mark.usefixtures("compiler")
 @pytest.mark.parametrize(
     "data, message",
     [

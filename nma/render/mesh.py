@@ -76,12 +76,26 @@ def _load(description: dict[str, Any], path: str | Path) -> Any:
     import mitsuba as mi
 
     try:
-        # Without triangles Mitsuba stumbles over the normals that it computes.
-        if mi.load_dict(description | {"face_normals": True}).face_count() == 0:
-            raise MeshError(f"mesh {path} is empty: it has no triangles")
+        # Where Mitsuba computes normals it stumbles without triangles, and writes wherever their corners point.
+        _check_faces(mi.load_dict(description | {"face_normals": True}), path)
         return mi.load_dict(description)
     except RuntimeError as error:
         raise MeshError(f"mesh {path} cannot be read: {one_line(str(error))}") from error
+
+
+def _check_faces(mesh: Any, path: str | Path) -> None:
+    import mitsuba as mi
+
+    if mesh.face_count() == 0:
+        raise MeshError(f"mesh {path} is empty: it has no triangles")
+    corners = np.array(mi.traverse(mesh)["faces"], dtype=np.int64)
+    beyond = corners >= mesh.vertex_count()
+    if beyond.any():
+        first = int(np.argmax(beyond))
+        raise MeshError(
+            f"mesh {path}: triangle {first // 3} has the vertex {corners[first]}, "
+            f"but there are {mesh.vertex_count()} of them, counted from 0; export it anew"
+        )
 
 
 def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:

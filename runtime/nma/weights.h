@@ -6,7 +6,6 @@
 #include <cstdint>
 #include <cstring>
 #include <fstream>
-#include <iterator>
 #include <tuple>
 
 #include "json.h"
@@ -254,8 +253,11 @@ inline Weights parse_weights(const void* bytes, std::size_t size) { return detai
 // The bytes of a file. Throws `Error`.
 inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
-    if (!file) throw Error("no such weights file, or it cannot be read");
-    return {std::istreambuf_iterator<char>(file), {}};
+    std::string bytes;
+    // Iterators would throw what is no `Error` where a folder, or a disk that fails, opens but cannot be read.
+    for (char block[1 << 14]; file.read(block, sizeof block), file.gcount() > 0;) bytes.append(block, static_cast<std::size_t>(file.gcount()));
+    if (!file.eof()) throw Error("no such weights file, or it cannot be read");
+    return bytes;
 }
 
 }  // namespace nma
