@@ -154,6 +154,28 @@ def test_frozen_functions_follow_edits(adapter, kind):
     assert max(inside.n_recordings, frozen.n_recordings) <= 2
 
 
+@pytest.mark.parametrize("kind", ("plain", "textured"))
+def test_frozen_functions_see_derivatives_of_numbers_set_before(adapter, kind):
+    """They get the curves of a plain material and the number that these were made from side by side."""
+
+    def derive(loaded, params):
+        dr.backward(dr.mean(mi.render(loaded, params, spp=64), axis=None))
+        return dr.grad(params["ball.bsdf.sigma_t"])
+
+    loaded = scene(BESIDE[kind](adapter), "prb")
+    params = mi.traverse(loaded)
+    gradients = []
+    for function in (derive, dr.freeze(derive)):
+        for value in (0.3, 0.7):
+            sigma_t = dr.opaque(mi.Float, value)
+            dr.enable_grad(sigma_t)
+            params["ball.bsdf.sigma_t"] = sigma_t
+            params.update()
+            gradients.append(function(loaded, params)[0])
+    assert abs(gradients[0]) > 1e-3
+    np.testing.assert_allclose(gradients[2:], gradients[:2], rtol=0.02)
+
+
 def refused(function, message):
     with pytest.raises((NmaError, RuntimeError)) as error:
         function()

@@ -7,6 +7,7 @@ import pytest
 import nma.render
 from nma.jit import dr
 from nma.materials import names
+from nma.render.bsdf import blended
 from nma.render.measure import measure, zscore_images
 from nma.render.scene import bitmap_texture
 from nma.sources import layered_eval
@@ -285,3 +286,17 @@ def test_white_furnace():
     # Facets this narrow still mask some grazing light below the coat: .1 %.
     same = zscore_images(result.mean, result.variance, 6, one, 0 * one, 1, rounding=1e-3, false_alarm=1e-3)
     assert same.passed, f"p {same.p_values.min():.1e} below {same.level:.1e} at {same.worst}"
+
+
+def test_scenes_loaded_one_after_the_other_know_their_composites():
+    """What the last scene left, names and addresses alike, says nothing about this one."""
+    blend = {"type": "blendbsdf", "weight": 0.5, "a": LACQUER, "b": {"type": "diffuse"}}
+    kept = []
+    for composite in (True, False, True, True, False, False):
+        scene = mi.load_dict(
+            {"type": "scene", "ball": {"type": "sphere", "bsdf": blend if composite else LACQUER}}
+        )
+        bsdf = mi.traverse(scene).hierarchy
+        (ours,) = (part for part in bsdf if type(part).__name__ == "Layered")
+        kept.append(bytes(range(256)))
+        assert blended(ours) == composite

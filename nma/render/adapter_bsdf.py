@@ -137,7 +137,7 @@ def define() -> type:
             """
             self.inputs.check()
             cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
-            if self._curves is not None:
+            if self._curves is not None and not self._apart():
                 return self._curves.at(cos_theta_i, front)
             asked = mi.SurfaceInteraction3f(si), active
             if blend := self._recorded.take(asked, dr.grad_enabled(attached)):
@@ -147,6 +147,11 @@ def define() -> type:
             if si.wi.z.state == dr.VarState.Symbolic:
                 self._recorded.leave(asked, dr.grad_enabled(attached), blend)
             return blend
+
+        def _apart(self) -> bool:
+            """Whether derivatives of the curves do not reach the inputs: both come into a frozen function, which knows
+            nothing of what was computed before it. There the network runs at every shading point."""
+            return dr.flag(dr.JitFlag.FreezingScope) and dr.grad_enabled(self.inputs.values)
 
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""

@@ -32,6 +32,10 @@ def define_base() -> type:
     class OneSided(mi.BSDF):
         inputs: Any = None
 
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.serial = next(_serials)
+
         def _declare(self, *flags: mi.BSDFFlags) -> None:
             """One component: glossy reflection on the front, with these flags besides."""
             both = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
@@ -131,14 +135,21 @@ def blended(bsdf: Any) -> bool:
     """
     global _blends
     everything = _registered()
-    key = [(type(other), other.class_name(), other.id()) for other in everything]
+    key = [(type(other), other.class_name(), other.id(), _serial(other)) for other in everything]
     if _blends[0] != key:
         _blends = key, _inside_blends(everything)
-    return id(bsdf) in _blends[1]
+    return bsdf.serial in _blends[1]
 
 
-# What `blended` found last: in which BSDFs, and the identities of those inside a blend.
+# Numbers of our BSDFs, never given out again: scenes that are loaded one after the other may share addresses and names.
+_serials = count(1)
+# What `blended` found last: in which BSDFs, and the numbers of ours inside a blend.
 _blends: tuple[list[Any], set[int]] = [], set()
+
+
+def _serial(bsdf: Any) -> int:
+    """The number of one of our BSDFs; 0 for others."""
+    return getattr(bsdf, "serial", 0)
 
 
 def _registered() -> list[Any]:
@@ -165,5 +176,5 @@ def _inside_blends(everything: list[Any]) -> set[int]:
     inside = set()
     for bsdf in everything:
         if bsdf.class_name() not in _HAND_ON:
-            inside |= {id(part) for part in mi.traverse(bsdf).hierarchy if part is not bsdf}
+            inside |= {_serial(part) for part in mi.traverse(bsdf).hierarchy if part is not bsdf}
     return inside
