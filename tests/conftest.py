@@ -15,6 +15,8 @@ from nma import cli, llvm
 CACHE = Path(__file__).parents[1] / "build/tests"
 os.environ["XDG_CACHE_HOME"] = str(CACHE)
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "jax")
+# XLA's older emitters take half the time to compile what trains here.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 
 @pytest.fixture

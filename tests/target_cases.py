@@ -9,6 +9,7 @@ from nma.target import Blend, Principled
 FAST_COMPILE = {
     "compiler_options": {
         "xla_disable_hlo_passes": "fusion,cpu-instruction-fusion",
+        "xla_cpu_use_fusion_emitters": True,
         "xla_llvm_disable_expensive_passes": True,
     }
 }

@@ -1,7 +1,6 @@
 """Every experiment of `figures/` runs in its quick form and leaves its results: a new one is tested on arrival."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,16 +11,11 @@ ROOT = Path(__file__).parent.parent
 EXPERIMENTS = sorted(script.parent.name for script in (ROOT / "figures").glob("*/run.py"))
 
 NEED_DATA = {"library"}
-# Their quick forms train so little that compiling takes longest.
-FEW_STEPS = {"library", "measured"}
-FAST_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 def figures(*words):
     command = [sys.executable, str(ROOT / "figures"), *words]
-    flags = {"XLA_FLAGS": FAST_COMPILE} if set(words) & FEW_STEPS else {}
-    options = {"capture_output": True, "text": True, "cwd": ROOT, "timeout": 600, "check": False}
-    return subprocess.run(command, env={**os.environ, **flags}, **options)
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=600, check=False)
 
 
 @pytest.mark.slow
