@@ -36,7 +36,7 @@ def main() -> None:
     known = benches()
     if not arguments.names:
         for name, script in known.items():
-            print(f"{name:10} {(ast.get_docstring(ast.parse(script.read_text())) or '').splitlines()[0]}")
+            print(f"{name:12} {(ast.get_docstring(ast.parse(script.read_text())) or '').splitlines()[0]}")
         return
     unknown = set(arguments.names) - {"all", *known}
     if unknown:

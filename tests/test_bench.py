@@ -21,6 +21,8 @@ import settings  # noqa: E402
 import nma.render  # noqa: E402
 from nma.render.scene import CAMERAS  # noqa: E402
 
+# Those that draw what they found.
+PICTURED = ["density", "networks", "render", "samples", "scalar", "settings", "teaser"]
 SIMULATION = {"seconds": 2.0, "variance": 0.4, "error": 0.4, "doubt": 0.03}
 ADAPTER = {"seconds": 1.0, "variance": 0.2, "error": 0.5, "doubt": 0.04}
 OTHER = {"seconds": 1.0, "variance": 0.2, "error": None, "doubt": None}
@@ -167,8 +169,7 @@ def test_scenes_render_what_is_measured(name):
 def test_without_a_name_they_are_listed():
     lines = bench().stdout.splitlines()
     names = [line.split()[0] for line in lines]
-    wanted = {"density", "networks", "render", "runtime", "samples", "scalar", "settings", "teaser"}
-    assert wanted <= set(names)
+    assert {*PICTURED, "reciprocity", "runtime"} <= set(names)
     assert all(len(line.split()) > 3 for line in lines)
     unknown = bench("no-such-bench")
     assert unknown.returncode != 0
@@ -176,11 +177,11 @@ def test_without_a_name_they_are_listed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["density", "networks", "render", "samples", "scalar", "settings", "teaser"])
+@pytest.mark.parametrize("name", PICTURED + ["reciprocity"])
 def test_quick(name, tmp_path):
     run = bench(name, "--quick", "--output", tmp_path)
     assert run.returncode == 0, run.stdout + run.stderr
     written = json.loads((tmp_path / f"{name}.json").read_text())
     assert written["machine"][0].startswith("machine")
     assert written["settings"]["quick"]
-    assert (tmp_path / f"{name}.png").exists()
+    assert (tmp_path / f"{name}.png").exists() == (name in PICTURED)
