@@ -8,6 +8,7 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from nma.errors import NmaError, OutputError
 
@@ -48,6 +49,19 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     """Writes a whole file, as `whole`."""
     with whole(path) as file:
         file.write_bytes(content)
+
+
+@contextmanager
+def arrays(path: str | Path) -> Iterator[Any]:
+    """The arrays of an .npz file, by name. What is none is a `ValueError`, where NumPy would advise to unpickle it."""
+    import numpy as np
+
+    with Path(path).open("rb") as file:
+        if file.read(2) != b"PK":
+            raise ValueError("it is no .npz file")
+        file.seek(0)
+        with np.load(file) as found:
+            yield found
 
 
 def try_file(*paths: str | Path) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from nma import ops
 from nma.errors import OutputError, TableError
-from nma.files import whole
+from nma.files import arrays, whole
 from nma.jit import dr
 from nma.ops import Vec3
 from nma.sources.base import Source, Walk
@@ -121,7 +121,7 @@ class Tables:
         """Reads a reference file; `TableError` says what is wrong with it."""
         path = Path(path)
         try:
-            with path.open("rb") as file, np.load(file) as f:
+            with arrays(path) as f:
                 params, values, walks = f["params"], f["table"], f["walks"]
                 error = f["error"] if "error" in f else None
         except FileNotFoundError:

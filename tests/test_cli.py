@@ -168,8 +168,14 @@ def test_a_bsdf_is_fitted_and_rendered(nma, tmp_path):
         (("render", "gold-red-lacquer", "--variant", "metal_rgb"), "no variant"),
         (("render", "gold-red-lacquer", "--variant", "llvm_ad_mono"), "rendered in RGB"),
         (("demo", "--variant", "llvm_ad_spectral"), "rendered in RGB"),
-        (("train", "layered3", "--stream", 1, "-o", "x", "--network", "\u00b2x\u00b2"), "DEPTHxWIDTH"),
-        (("train", "layered3", "--stream", 1, "-o", "x", "--network", "99999x99999"), "at most 64x1024"),
+        (
+            ("train", "layered3", "--stream", 1, "-o", "x.safetensors", "--network", "\u00b2x\u00b2"),
+            "DEPTHxWIDTH",
+        ),
+        (
+            ("train", "layered3", "--stream", 1, "-o", "x.safetensors", "--network", "99999x99999"),
+            "at most 64x1024",
+        ),
         (("render", "gold-red-lacquer", "--adapter", "no-such"), "no-such"),
         (("compare", "a.exr", "b.exr"), "does not exist"),
         (("evaluate", "no-such", "--reference", "no.npz"), "no-such"),
@@ -194,7 +200,8 @@ def test_a_mistake_is_one_line_on_stderr(nma, tmp_path, monkeypatch, arguments, 
         ("render", "gold-red-lacquer", "-o", "gold.jpg"),
         ("render", "gold-red-lacquer", "--set", "alpha_top"),
         ("simulate", "-o", "x.npz"),
-        ("train", "layered3", "--stream", 1, "-o", "x", "--preset", "anisotropic"),
+        ("train", "layered3", "--stream", 1, "-o", "x.safetensors", "--preset", "anisotropic"),
+        ("data", "merl", "gold-red-lacquer", "--material", "x", "-o", "x.binary"),
     ],
 )
 def test_wrong_usage_exits_with_2(nma, arguments):

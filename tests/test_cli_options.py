@@ -42,14 +42,14 @@ def test_words_to_choose_from_are_those_that_are_declared():
     "words",
     [
         *(
-            ("fit", "gold-red-lacquer", "-o", "x", f"--{o}", "no")
+            ("fit", "gold-red-lacquer", "-o", "x.safetensors", f"--{o}", "no")
             for o in ("target", "loss", "points-law", "variant")
         ),
         *(
-            ("train", "layered3", "-o", "x", "--stream", 1, f"--{o}", "no")
+            ("train", "layered3", "-o", "x.safetensors", "--stream", 1, f"--{o}", "no")
             for o in ("preset", "variant", "loss")
         ),
-        ("simulate", "--draw", 1, "-o", "x", "--population", "no"),
+        ("simulate", "--draw", 1, "-o", "x.npz", "--population", "no"),
         ("dataset", "layered3", "x", "--population", "unseen_metals"),
     ],
     ids=lambda words: "".join(words[:1] + words[-2:-1]),
@@ -60,6 +60,39 @@ def test_words_that_are_none_of_these_are_wrong_usage(nma, tmp_path, monkeypatch
     assert (code, out) == (2, "")
     assert f"'{words[-2]}'" in err and "is not one of" in err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "ending"),
+    [
+        (("simulate", "--draw", 1, "--walks", 100), ".npz"),
+        (("fit", "gold-red-lacquer"), ".safetensors"),
+        (("train", "layered3", "--stream", 1), ".safetensors"),
+        (("train-library", "merl"), ".safetensors"),
+        (("library", "encode", "a.safetensors", "b.bsdf"), ".safetensors"),
+        (("library", "extract", "a.safetensors", "b"), ".safetensors"),
+        (("principled", "gold-red-lacquer"), ".xml"),
+        (("data", "merl", "gold-red-lacquer"), ".binary"),
+        (("render", "gold-red-lacquer"), ".png"),
+        (("compare", "a.png", "b.png"), ".png"),
+        (("demo",), ".png"),
+    ],
+    ids=lambda given: given if isinstance(given, str) else given[0],
+)
+def test_outputs_are_called_as_what_reads_them_wants(nma, tmp_path, monkeypatch, words, ending):
+    """Weights in `x.bin` were written after all the work, and no command took them."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("x", "x.bin"):
+        code, out, err = nma(*words, "-o", name)
+        assert (code, out) == (2, "")
+        assert f"{name} must end in {ending}" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_is_refused_before_a_material_is_simulated(nma, tmp_path, monkeypatch):
+    monkeypatch.setattr("nma.cli.material.read", None)
+    code, _, err = nma("fit", "gold-red-lacquer", "--network", "0x8", "-o", tmp_path / "x.safetensors")
+    assert code == 1 and "DEPTHxWIDTH" in err
 
 
 def test_the_version_is_printed(nma):

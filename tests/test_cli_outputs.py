@@ -74,7 +74,9 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
             raise OSError(errno.ENOSPC, "No space left on device")
 
         monkeypatch.setattr(Path, "write_bytes", full)
-    ending = {"render": ".png", "principled": ".xml", "merl": ".binary"}.get(words[-1], "")
+    endings = {"principled": ".xml", "merl": ".binary", "simulate": ".npz", "dataset": ""}
+    endings |= dict.fromkeys(("render", "compare", "demo"), ".png")
+    ending = endings.get(words[-1], ".safetensors")
     code, out, err = nma(*arguments(words, place.format(ending)))
     assert (code, out) == (1, ""), err
     assert err.startswith("nma: ") and err.count("\n") == 1

@@ -2,14 +2,16 @@
 
 import errno
 import os
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nma import image_io
-from nma.errors import OutputError
+from nma.errors import NmaError, OutputError
 from nma.files import try_file, try_folder, whole, write_bytes
+from nma.sources import nbrdf
 from nma.sources.merl import SHAPE, Merl
 from nma.table import Tables
 from nma.train.plot import plot_losses
@@ -101,3 +103,13 @@ def test_a_full_disk_is_noticed_by_the_trial(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "write_bytes", _full)
     with pytest.raises(OutputError, match="free some space"):
         try_file(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("content", [b"", b"title = 'x'", pickle.dumps([1])])
+def test_what_is_no_archive_is_refused_without_advice_to_unpickle_it(tmp_path, content):
+    path = tmp_path / "gold.npz"
+    path.write_bytes(content)
+    for read in (Tables.load, nbrdf.read):
+        with pytest.raises(NmaError, match=r"gold\.npz: .*it is no \.npz file") as error:
+            read(path)
+        assert "pickle" not in str(error.value)

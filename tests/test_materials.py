@@ -132,6 +132,7 @@ def test_sources_take_what_adapters_do_not_know(write):
         ("layered3", "layered4", "no class 'layered4'; there is layered3"),
         ('"Au"', '"Gold"', "no conductor 'Gold'"),
         ('"Au"', '"Aux"', r"did you mean 'Au'\?"),
+        ('"Au"', '"au"', r"did you mean 'Au'\?"),
         ("albedo", "k_conductor = 1\nalbedo", "either conductor or k_conductor"),
         ("albedo = 0.5", "albedo = [1, 2]", "must be a number or a list of 3"),
         ("albedo = 0.5", "albedo = 1.5", r"albedo .* allowed is 0 \.\. 1"),

@@ -66,7 +66,7 @@ def materials(
 
 
 def simulate(
-    output: Annotated[Path, typer.Option("--output", "-o", help="The reference file (.npz) to write.")],
+    output: Annotated[Path, options.output("The reference file to write.", ".npz")],
     params: Annotated[
         Path | None, typer.Option(help="A file (.npz) with `params` (n, 13), a reference file for example.")
     ] = None,
@@ -164,7 +164,7 @@ def _vectors(space, params, material, draw, population, seed):
         raise typer.BadParameter("give exactly one of --params, --material and --draw")
     if params is not None:
         try:
-            with params.open("rb") as file, np.load(file) as f:
+            with files.arrays(params) as f:
                 vectors = np.asarray(f["params"], np.float64)
         except Exception as e:  # zipfile raises a kind of its own for damaged archives
             raise TableError(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from nma import files
-from nma.cli import console
+from nma.cli import console, options
 
 data = typer.Typer(
     invoke_without_command=True,
@@ -64,7 +64,7 @@ def merl(
             "(.safetensors), or a named material or material file (.toml), which --adapter evaluates."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The file (.binary) to write.")],
+    output: Annotated[Path, options.output("The file to write.", ".binary")],
     material: Annotated[str | None, typer.Option(help="Which network of an NBRDF file.")] = None,
     adapter: Annotated[
         str,
@@ -81,8 +81,6 @@ def merl(
 
     Example: [bold]nma data merl gold-red-lacquer -o gold.binary[/bold]
     """
-    if output.suffix != ".binary":
-        raise typer.BadParameter(f"output {output} must end in .binary")
     files.try_file(output)
     from nma.cli.material import values_of
     from nma.sources.merl import SCALE, Merl

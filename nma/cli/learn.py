@@ -47,7 +47,7 @@ def register(app: typer.Typer) -> None:
 
 def train(
     class_name: Annotated[str, typer.Argument(help="The class to learn, layered3.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    output: options.Weights,
     data: Annotated[Path | None, typer.Option(help="A dataset made by `nma dataset`.")] = None,
     stream: Annotated[
         int,
@@ -124,7 +124,7 @@ def fit(
             ".xml, NBRDF's .npz); or a reference file (.npz)."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    output: options.Weights,
     material: Annotated[
         str | None,
         typer.Option(

@@ -32,7 +32,7 @@ def train_library(
             metavar="DIR", help="A folder with files of materials, or one NBRDF weights file (.npz)."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    output: options.Weights,
     network: options.Network = None,
     steps: options.Steps = None,
     learning_rate: options.Rate = None,
@@ -98,7 +98,7 @@ def listing(path: _Library) -> None:
 def encode(
     path: _Library,
     source: Annotated[Path, typer.Argument(help="A file with the new material's values.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The library with one material more.")],
+    output: Annotated[Path, options.output("The library with one material more.", ".safetensors")],
     material: Annotated[str | None, typer.Option(help="Which one, in a file of several.")] = None,
     name: Annotated[
         str | None, typer.Option(help="What to call it; without, its own name or the file's.")
@@ -142,7 +142,7 @@ def extract(
     materials: Annotated[
         list[str], typer.Argument(help="A material's name, or NAME=WEIGHT of several to mix their codes.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The weights file to write.")],
+    output: options.Weights,
 ) -> None:
     """Write one material of a library, or a mixture of some, as an adapter of its own.
 

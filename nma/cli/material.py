@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import typer
 
 from nma.cli import console
 from nma.errors import SourceError, TableError
+from nma.files import arrays
 
 if TYPE_CHECKING:
     from nma.sources.base import Values
@@ -32,11 +32,9 @@ def read(
     """
     from nma import materials
 
-    path = Path(source)
+    path = _path(source, material)
     if path.suffix == ".npz":
         return _reference(path, material) if _holds_tables(path) else _values(path, material)
-    if material is not None:
-        raise typer.BadParameter(f"--material chooses in .npz files; {source} is a single material")
     if path.suffix in ("", ".toml") or source in materials.names():
         return _simulated(source, walks, seed)
     return _values(path, None)
@@ -71,7 +69,7 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
     from nma.adapter import Adapter
     from nma.sources.adapter import AdapterValues
 
-    path = Path(source)
+    path = _path(source, material)
     if path.suffix == ".npz" and _is_reference(path):
         raise TableError(
             f"{path}: holds tables, whose bins are too wide; fit it first: nma fit {path} -o X.safetensors"
@@ -82,6 +80,13 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
         known, network = materials.load(source), Adapter.load(adapter)
         return AdapterValues(network, network.check(known.vector(), clamp)[0], known.name)
     return _values(path, material)[0]
+
+
+def _path(source: str, material: str | None) -> Path:
+    path = Path(source)
+    if material is not None and path.suffix != ".npz":
+        raise typer.BadParameter(f"--material chooses in .npz files; {source} is a single material")
+    return path
 
 
 def _simulated(name: str, walks: int, seed: int) -> tuple[Tables, dict[str, Any]]:
@@ -138,7 +143,7 @@ def _is_reference(path: Path) -> bool:
 def _holds_tables(path: Path) -> bool:
     """Whether an .npz file is a reference file; those of NBRDF networks have other arrays."""
     try:
-        with path.open("rb") as file, np.load(file) as f:
+        with arrays(path) as f:
             return "weights" not in f
     except Exception:  # whoever reads it says what is wrong
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -47,6 +48,26 @@ def choice(help: str, *values: str) -> Any:
     return typer.Option(help=f"{', '.join(values)}. {help}", callback=check)
 
 
+def output(help: str, *endings: str, **more: Any) -> Any:
+    """A file to write, whose name ends as those do that read it."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None and path.suffix not in endings:
+            raise typer.BadParameter(f"{path} must end in {' or '.join(endings)}")
+        return path
+
+    return typer.Option("--output", "-o", help=help, callback=check, **more)
+
+
+def _network(name: str | None) -> str | None:
+    """Refused at once rather than after the simulation of a material."""
+    if name is not None:
+        from nma.network import hidden
+
+        hidden(name)
+    return name
+
+
 _STEPS = number("Number of optimisation steps.", 1, 10**9)
 _RATE = number("Learning rate of Adam, its peak under the one-cycle schedule.", 1e-9, 10)
 
@@ -61,4 +82,8 @@ POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
 VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
 
 Variant = Annotated[str, choice("Whether two instances are blended, and follow the direction.", *VARIANTS)]
-Network = Annotated[str | None, typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.")]
+Network = Annotated[
+    str | None,
+    typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.", callback=_network),
+]
+Weights = Annotated[Path, output("The weights file to write.", ".safetensors")]

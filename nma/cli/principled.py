@@ -34,10 +34,11 @@ def principled(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors).",
+        options.output(
+            "A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors).",
+            ".xml",
+            ".json",
+            ".safetensors",
         ),
     ] = None,
     walks: Annotated[int, options.walks("Walks of the table, if the material is simulated.")] = 16_000_000,
@@ -51,8 +52,6 @@ def principled(
     Examples: [bold]nma principled gold-red-lacquer -o gold.xml[/bold],
     [bold]nma principled paper_white_rgb.bsdf[/bold]
     """
-    if output is not None and output.suffix not in (".xml", ".json", ".safetensors"):
-        raise typer.BadParameter(f"output {output} must end in .xml, .json or .safetensors")
     if output is not None:
         files.try_file(output)
     from nma.cli.material import tables_of

@@ -67,8 +67,8 @@ def render(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", help="OUT.png or OUT.exr; both are written.", show_default="out/SUBJECT.png"
+        options.output(
+            "OUT.png or OUT.exr; both are written.", ".png", ".exr", show_default="out/SUBJECT.png"
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="nma, the adapter, or layered, the reference.")] = "nma",
@@ -150,7 +150,7 @@ def compare(
         bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
     ] = False,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="A PNG with both images and the map of their FLIP.")
+        Path | None, options.output("A PNG with both images and the map of their FLIP.", ".png")
     ] = None,
     exposure: Annotated[float, options.exposure("Stops before ssim, flip_ldr and in the PNG.")] = 0.0,
     adapter: _AdapterName = "layered3-5x64",
@@ -211,7 +211,7 @@ def compare(
 
 
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out/demo.png"),
+    output: Annotated[Path, options.output("The PNG to write.", ".png")] = Path("out/demo.png"),
     adapter: _AdapterName = "layered3-5x64",
     size: _Size = "256",
     spp: Annotated[int, options.samples("Samples per pixel of the frames that are timed.")] = 64,
@@ -339,8 +339,6 @@ def _pixels(text: str) -> tuple[int, int]:
 
 def _outputs(path: Path) -> tuple[Path, Path]:
     """The EXR and the PNG that belong to an output file's name."""
-    if path.suffix not in (".png", ".exr"):
-        raise typer.BadParameter(f"output {path} must end in .png or .exr; both are written")
     return path.with_suffix(".exr"), path.with_suffix(".png")
 
 

@@ -298,5 +298,7 @@ def _refuse_unknown(given: Mapping[str, Any], known: tuple[str, ...], where: str
 
 
 def _suggestion(given: Any, known: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(_short(given) if isinstance(given, str) else "", known, n=1, cutoff=0.5)
-    return f" (did you mean '{close[0]}'?)" if close else ""
+    names = {name.casefold(): name for name in reversed(known)}
+    text = _short(given).casefold() if isinstance(given, str) else ""
+    close = difflib.get_close_matches(text, names, n=1, cutoff=0.5)
+    return f" (did you mean '{names[close[0]]}'?)" if close else ""

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from nma.errors import SourceError
+from nma.files import arrays
 from nma.sources import merl, nbrdf, rgl
 
 
@@ -176,7 +175,7 @@ def _belongs(path: Path) -> bool:
     if path.suffix != ".npz":
         return path.suffix in _READERS
     try:
-        with path.open("rb") as file, np.load(file) as f:
+        with arrays(path) as f:
             return "weights" in f or path.name in _NAMES
     except Exception:  # zipfile raises a kind of its own for damaged archives
         return path.name in _NAMES

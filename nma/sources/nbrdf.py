@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from nma import network
 from nma.errors import SourceError
+from nma.files import arrays
 from nma.jit import dr
 from nma.ops import Color, Vec3
 from nma.sources.half_difference import half_difference
@@ -73,7 +74,7 @@ def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
     """Names (n) and weights (n, 675) of a weights file; `SourceError` says what is wrong with it."""
     path = Path(path)
     try:
-        with path.open("rb") as file, np.load(file) as f:
+        with arrays(path) as f:
             names, weights = f["names"], f["weights"]
     except FileNotFoundError:
         raise SourceError(

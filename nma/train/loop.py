@@ -16,7 +16,7 @@ import numpy as np
 import optax
 
 from nma.errors import NmaError
-from nma.files import whole
+from nma.files import arrays, whole
 from nma.train.data import batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
@@ -170,7 +170,7 @@ def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] |
     if not path.exists():
         return run
     try:
-        with path.open("rb") as file, np.load(file) as f:
+        with arrays(path) as f:
             notes = json.loads(str(f["notes"]))
             leaves = [f[f"leaf{k}"] for k in range(len(jax.tree.leaves(run.state)))]
             losses, log_losses = f["losses"].tolist(), f["log_losses"].tolist()
