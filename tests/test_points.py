@@ -90,6 +90,7 @@ def test_a_fit_finds_a_principled_brdf():
     assert adapter.space.name == "measured" and run.step == 400
 
 
+@pytest.mark.slow
 def test_an_anisotropic_fit_knows_azimuths(tmp_path):
     source = from_dict(BRUSHED)
     assert not source.isotropic

@@ -124,6 +124,7 @@ def test_sanitizers_find_nothing(sanitizer, tmp_path):
     assert ", 0 faults" in output(program, 100_000, WEIGHTS[0])
 
 
+@pytest.mark.slow
 def test_a_million_calls_are_sound(weights, tmp_path):
     program = built("g++", "tests/soak.cpp", tmp_path, "-O2")
     for path in weights:
@@ -157,6 +158,7 @@ def test_the_c_header_is_c(tmp_path):
         assert output(tmp_path / name) == ""
 
 
+@pytest.mark.slow
 def test_it_installs_for_cmake_and_pkg_config(tmp_path):
     cmake, prefix = tool("cmake"), tmp_path / "prefix"
     for words in (

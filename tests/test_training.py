@@ -117,6 +117,7 @@ def test_a_time_budget_ends_a_run(tables):
     assert run.step == loop.GROUP
 
 
+@pytest.mark.slow
 def test_a_fit_approaches_what_it_fits():
     """The table of a target that the network can say exactly: a log loss of less than .003 within 300 steps."""
     params = LAYERED3.sample(np.random.default_rng(0), 1)
@@ -137,6 +138,7 @@ def test_a_fit_approaches_what_it_fits():
     assert adapter.variant == "blended + omega_i"
 
 
+@pytest.mark.slow
 def test_the_paper_s_preset_runs(tables):
     """Batches of 1000 bins, 20 uniform points, one pass per bin, raw inputs, Adam with 1e-5."""
     assert (PAPER.rows, PAPER.bins_per_row, PAPER.points) == (1000, 1, 20)
