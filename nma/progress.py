@@ -54,6 +54,7 @@ class TrainingBar:
     def update(self, run: Any) -> None:
         if self._first is None:
             self._first, self._began = run.step, time.perf_counter()
+            self._bar.update(self._task, completed=run.step)
             return
         rate = (
             (run.step - self._first) * self._recipe.bins_per_step / (time.perf_counter() - self._began) / 1e6

@@ -2,6 +2,7 @@
 
 import io
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,6 +108,14 @@ def test_a_fit_shows_a_bar_on_terminals_alone_and_none_if_told(monkeypatch):
         monkeypatch.setattr(sys.stderr, "isatty", lambda terminal=terminal: terminal)
         fit.fit(object(), SINGLE, progress=given)
         assert Bar.made == bars
+
+
+def test_the_bar_of_a_short_training_is_full_at_its_end(monkeypatch):
+    """Which looks at its loss once alone."""
+    monkeypatch.setattr(progress, "err", Console(file=io.StringIO(), width=100))
+    with progress.TrainingBar(SimpleNamespace(steps=30, bins_per_step=1)) as bar:
+        bar.update(SimpleNamespace(step=30, log_losses=[0.1]))
+    assert "30/30" in progress.err.file.getvalue()
 
 
 def test_a_dataset_says_how_long_it_will_take(nma, tmp_path):

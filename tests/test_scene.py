@@ -151,6 +151,19 @@ def test_wrong_options_are_refused(options):
         preview_scene(GREY, **options)
 
 
+def test_environment_maps_that_are_none_are_refused_by_name(tmp_path):
+    """Pictures of NaN, after all the work, said nothing of the map."""
+    sky = np.ones((4, 8, 3), np.float32)
+    sky[1, 2] = np.nan
+    (tmp_path / "text.exr").write_text("sky")
+    for path, fault in (
+        (tmp_path / "text.exr", "cannot be read"),
+        (write_exr(tmp_path / "nan.exr", sky), "NaN or infinite"),
+    ):
+        with pytest.raises(ParamError, match=f"environment map .*{path.name} .*{fault}"):
+            preview_scene(GREY, envmap=path)
+
+
 def test_camera_and_integrator_may_be_given_whole():
     camera = Camera((0.0, -3.0, 1.0), (0.0, 0.0, 1.0), 20.0)
     scene = preview_scene(GREY, camera=camera, integrator={"type": "direct"}, size=(4, 4))

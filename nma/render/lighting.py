@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.errors import ParamError
-from nma.image_io import check_size
+from nma.errors import ParamError, one_line
+from nma.image_io import load_bitmap
 from nma.llvm import ensure_llvm
 
 Array = NDArray[np.float64]
@@ -88,11 +88,16 @@ def environment(path: Path, scale: float) -> dict[str, Any]:
     """An environment map alone.
 
     Raises:
-        ParamError: there is no such file.
+        ParamError: there is no such file, it is no image, or has pixels that are not finite.
     """
     if not path.is_file():
         raise ParamError(f"environment map {path} does not exist; pass an EXR or HDR file")
-    check_size(path)
+    try:
+        pixels = np.array(load_bitmap(path))
+    except RuntimeError as error:
+        raise ParamError(f"environment map {path} cannot be read: {one_line(str(error))}") from error
+    if not np.isfinite(pixels).all():
+        raise ParamError(f"environment map {path} has pixels that are NaN or infinite; export it anew")
     return {"sky": {"type": "envmap", "filename": str(path), "scale": scale, "to_world": _upright()}}
 
 
