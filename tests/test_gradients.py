@@ -49,8 +49,9 @@ CASES = {
 }
 
 
-def scene(bsdf, depth, sky):
-    """A ball on a floor of the same material under a point light, and a uniform sky of that radiance."""
+def scene(bsdf, depth, sky, beside=None):
+    """A ball on a floor of the same material under a point light, and a uniform sky of that radiance; another material
+    beside it if that is given."""
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}}
     look = mi.ScalarTransform4f().look_at([0.0, -3.0, 2.5], [0.0, 0.0, 0.4], [0.0, 0.0, 1.0])
     same = {"type": "ref", "id": "material"}
@@ -63,6 +64,8 @@ def scene(bsdf, depth, sky):
         "floor": {"type": "rectangle", "bsdf": same},
         "ball": {"type": "sphere", "center": [0.0, 0.0, 0.5], "radius": 0.5, "bsdf": same},
     }
+    if beside:
+        description["other"] = {"type": "sphere", "center": [0.9, 0.0, 0.3], "radius": 0.3, "bsdf": beside}
     if sky:
         description["sky"] = {"type": "constant", "radiance": sky}
     return mi.load_dict(description)
@@ -137,6 +140,37 @@ def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
         assert abs(found.mean() - expected.mean()) < 4.0 * error, key
         # A derivative off by a half would be seen.
         assert error < 0.1 * abs(expected.mean()), key
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("blended", (False, True), ids=("alone", "blended"))
+def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
+    """In a scene of several BSDFs, which Dr.Jit calls in scopes of their own."""
+    bsdf, directions = case(name, tmp_path)
+    within, key = (
+        ("material.bsdf_0.", next(iter(directions))) if blended else ("material.", next(iter(directions)))
+    )
+    mixed = {"type": "blendbsdf", "weight": 0.3, "a": bsdf, "b": {"type": "diffuse"}}
+    loaded = scene(mixed if blended else bsdf, depth=3, sky=0.5, beside={"type": "diffuse"})
+    params, found = mi.traverse(loaded), []
+    for forward in (True, False):
+        amount = dr.opaque(mi.Float, 0.0)
+        dr.enable_grad(amount)
+        value = params[within + key]
+        flat = value.array if isinstance(value, mi.TensorXf) else value
+        params[within + key] = (
+            mi.TensorXf(flat + amount, value.shape) if flat is not value else value + amount
+        )
+        params.update()
+        mean = dr.mean(mi.render(loaded, params, spp=16, seed=1), axis=None)
+        if forward:
+            dr.forward(amount)
+        else:
+            dr.backward(mean)
+        found.append(np.array(dr.grad(mean if forward else amount)).item())
+        params[within + key] = dr.detach(value)
+    assert abs(found[0]) > 1e-3
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
 
 
 @pytest.mark.slow

@@ -137,21 +137,19 @@ def define() -> type:
             """
             self.inputs.check()
             cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
-            if self._curves is not None and not self._apart():
-                return self._curves.at(cos_theta_i, front)
-            asked = mi.SurfaceInteraction3f(si), active
+            if self._curves is not None:
+                return self._curves.at(
+                    cos_theta_i, self.inputs.columns() if self._curves.slopes else [], front
+                )
+            asked = dr.detach(mi.SurfaceInteraction3f(si)), active
             if blend := self._recorded.take(asked, dr.grad_enabled(attached)):
                 return blend
             columns, tangent = self.inputs.columns(si, front), (si.wi.x, si.wi.y)
             blend = self.adapter.prepare(columns, cos_theta_i, front, tangent)
-            if si.wi.z.state == dr.VarState.Symbolic:
+            derived = dr.grad_enabled(target.numbers(blend, self.adapter.target))
+            if si.wi.z.state == dr.VarState.Symbolic and not derived:
                 self._recorded.leave(asked, dr.grad_enabled(attached), blend)
             return blend
-
-        def _apart(self) -> bool:
-            """Whether derivatives of the curves do not reach the inputs: both come into a frozen function, which knows
-            nothing of what was computed before it. There the network runs at every shading point."""
-            return dr.flag(dr.JitFlag.FreezingScope) and dr.grad_enabled(self.inputs.values)
 
         def _plane(self, si) -> Plane:
             """The frame that the blend holds in."""
@@ -177,8 +175,9 @@ class _Recorded:
 
     Elsewhere its variables may not exist: Dr.Jit records all callables of a virtual call with the same arguments, in
     scopes that begin anew. So what was prepared is followed by a scope of its own, and only that may take it. The
-    arguments are kept, as the numbers of Dr.Jit's variables are given out anew when one is gone. Frozen functions do
-    not look into this class: they must not find symbolic variables.
+    arguments are kept, as the numbers of Dr.Jit's variables are given out anew when one is gone. Nothing that has
+    derivatives is: these would be followed in the next pass, where they lead nowhere. Frozen functions do not look into
+    this class: they must not find symbolic variables.
     """
 
     def __init__(self) -> None:

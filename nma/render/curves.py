@@ -24,11 +24,13 @@ MIN_COS = 1e-4
 class Curves:
     """The numbers of a blend (`nma.target.numbers`) at fixed cosines, linearly interpolated between them.
 
-    Any mixture of such numbers is a valid blend again. Derivatives reach the parameters that the curves were made from.
+    Any mixture of such numbers is a valid blend again. Derivatives reach the parameters that the curves were made from
+    by tables of slopes, not through what computed the curves: forward derivatives and frozen functions of Dr.Jit see
+    nothing of that.
     """
 
     # Frozen functions of Dr.Jit look for variables here.
-    DRJIT_STRUCT = {"table": object, "layers": list}  # noqa: RUF012
+    DRJIT_STRUCT = {"table": object, "slopes": dict, "layers": list}  # noqa: RUF012
 
     def __init__(self, adapter: Adapter, columns: Sequence[Float], nodes: int = NODES):
         """
@@ -46,17 +48,40 @@ class Curves:
 
     def update(self, columns: Sequence[Float]) -> None:
         """Makes the curves of other parameters, by the same kernels where only the numbers are others."""
-        mi = _mitsuba()
-        cosines = dr.maximum(dr.linspace(mi.Float, 0.0, 1.0, self.nodes), MIN_COS)
-        flat = numbers(_prepare(self.adapter, self.layers, columns, cosines), self.adapter.target)
-
-        # Node by node, filled up to whole packets.
-        flat += [0.0] * (self.packets * PACKET - self.adapter.size)
-        self.table = _interleaved(flat, self.nodes)
+        self.table = self._tabulated([dr.detach(column) for column in columns])
         dr.eval(self.table)
+        self.slopes = {
+            k: self._slope(columns, k) for k, column in enumerate(columns) if dr.grad_enabled(column)
+        }
 
-    def at(self, cos_theta_i: Float, active: Any = True) -> Blend:
-        """The blend at cos(theta_i) in 0..1."""
+    def at(self, cos_theta_i: Float, columns: Sequence[Float], active: Any = True) -> Blend:
+        """The blend at cos(theta_i) in 0..1; `columns` are those that the curves were made from, for derivatives."""
+        flat = self._looked_up(self.table, cos_theta_i, active)
+        for k, slope in self.slopes.items():
+            if dr.grad_enabled(columns[k]):
+                change = columns[k] - dr.detach(columns[k])  # 0, but for its derivative
+                steps = self._looked_up(slope, cos_theta_i, active)
+                flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
+        return self.adapter.blend(flat, cos_theta_i)
+
+    def _tabulated(self, columns: Sequence[Float]) -> Float:
+        """Node by node, filled up to whole packets."""
+        cosines = dr.maximum(dr.linspace(_mitsuba().Float, 0.0, 1.0, self.nodes), MIN_COS)
+        flat = numbers(_prepare(self.adapter, self.layers, columns, cosines), self.adapter.target)
+        return _interleaved(flat + [0.0] * (self.packets * PACKET - self.adapter.size), self.nodes)
+
+    def _slope(self, columns: Sequence[Float], k: int) -> Float:
+        """The derivative of the table by one column."""
+        mi = _mitsuba()
+        columns = [mi.Float(dr.detach(column)) for column in columns]
+        dr.enable_grad(columns[k])
+        dr.set_grad(columns[k], 1.0)
+        slope = dr.forward_to(self._tabulated(columns))
+        dr.eval(slope)
+        return slope
+
+    def _looked_up(self, table: Float, cos_theta_i: Float, active: Any) -> list[Float]:
+        """The numbers in a table at cos(theta_i)."""
         mi = _mitsuba()
         position = dr.clip(cos_theta_i, 0.0, 1.0) * (self.nodes - 1)
         left = dr.minimum(mi.UInt32(position), self.nodes - 2)
@@ -64,12 +89,13 @@ class Curves:
         flat = []
         for packet in range(self.packets):
             index = left * self.packets + packet
-            ends = [self._gather(index + step * self.packets, active) for step in (0, 1)]
+            ends = [self._gather(table, index + step * self.packets, active) for step in (0, 1)]
             flat += [dr.lerp(a, b, t) for a, b in zip(*ends, strict=True)]
-        return self.adapter.blend(flat[: self.adapter.size], cos_theta_i)
+        return flat[: self.adapter.size]
 
-    def _gather(self, index: Any, active: Any) -> Any:
-        return dr.gather(_mitsuba().ArrayXf, self.table, index, active, shape=(PACKET, dr.width(index)))
+    @staticmethod
+    def _gather(table: Float, index: Any, active: Any) -> Any:
+        return dr.gather(_mitsuba().ArrayXf, table, index, active, shape=(PACKET, dr.width(index)))
 
 
 def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], cos_theta_i: Float) -> Blend:
