@@ -180,6 +180,7 @@ def compare(
     if output:
         files.try_file(output)
     if reference is not None:
+        _refuse(context, _RENDERING, "two images")
         pictures = {"image": read_image(test), "reference": read_image(reference)}
     else:
         _refuse_unused(context)
@@ -244,6 +245,7 @@ def demo(
 
 
 _PREVIEW = ("camera", "lighting", "envmap", "mesh", "mesh_up", "depth")  # of the preview scene
+_RENDERING = ("adapter", "clamp", "changes", *_PREVIEW, "size", "spp", "seed", "variant")
 _MATERIAL_ONLY = ("model", "adapter", "clamp", "changes", *_PREVIEW)
 
 
