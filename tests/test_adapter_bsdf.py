@@ -338,6 +338,8 @@ def texture(value, channels=1):
         ({"adapter": "layered9-1x1"}, "layered9-1x1"),
         ({"adapter": "nowhere.safetensors"}, "nowhere.safetensors: no such weights file"),
         ({"adapter": 3}, "adapter"),
+        ({"material": 3}, "material wants a name (string), got 3"),
+        ({"clamp": "false"}, "clamp wants true or false (boolean), got 'false'"),
     ),
 )
 def test_wrong_inputs_are_refused(weights, changes, message):

@@ -220,6 +220,7 @@ def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
     coloured, shared = bitmap([0.1, 0.2, 0.3]), {"type": "srgb", "color": [0.1, 0.5, 0.9]}
     cases = [
         ({"sigma_t": 7.0}, "sigma_t is 7, allowed is 0 .. 1, the range"),
+        ({"sigma_t": math.nan}, "sigma_t is nan, allowed is 0 .. 1"),
         ({"precision": "half"}, "precision is float32, compact or bfloat16, not 'half'"),
         ({"adapter": "none"}, "none: no such weights file"),
         ({"albedo": None}, "no value for albedo"),

@@ -38,7 +38,7 @@ class Inputs:
         self.space, self.bounds, self.clamp = space, bounds, clamp
         given: dict[str, Any] = {}
         if "material" in props:
-            given |= _material_values(props["material"], space)
+            given |= _material_values(_setting(props, "material", ""), space)
         given |= {param.name: _read(param, props) for param in space.params if param.name in props}
         missing = [param.name for param in space.params if param.name not in given]
         if missing:
@@ -133,10 +133,10 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
     """
     import mitsuba as mi
 
-    clamp, known = props.get("clamp", False), adapter.material
+    clamp, known = _setting(props, "clamp", False), adapter.material
     if known is None:
         return Inputs(adapter.space, props, "training", clamp)
-    given = _material_values(props["material"], adapter.space) if "material" in props else {}
+    given = _material_values(_setting(props, "material", ""), adapter.space) if "material" in props else {}
     given |= {param.name: _read(param, props) for param in adapter.space.params if param.name in props}
     for name, value in given.items():
         if isinstance(value, mi.Texture):
@@ -282,6 +282,15 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
     if wanted not in CHANNELS:
         raise ParamError(f"{name} is {wanted!r}; take {', '.join(CHANNELS)}")
     return CHANNELS.index(wanted)
+
+
+def _setting(props: Any, name: str, default: Any) -> Any:
+    """A property that is no parameter, of the type of its default: the text "false" would be taken for true."""
+    value = props.get(name, default)
+    if not isinstance(value, type(default)):
+        wanted = "true or false (boolean)" if isinstance(default, bool) else "a name (string)"
+        raise ParamError(f"{name} wants {wanted}, got {value!r}")
+    return value
 
 
 def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:

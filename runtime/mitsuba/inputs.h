@@ -145,7 +145,9 @@ private:
         const Type type = props.type(p.name);
         if (type == Type::Float || type == Type::Integer) {
             input.shown = Colour(props.get<Float>(p.name));
-        } else if (type == Type::Color) {
+            return input;
+        }
+        if (type == Type::Color) {
             input.shown = props.get<Colour>(p.name);
         } else {
             input.texture = props.get_unbounded_texture<Texture>(p.name);
