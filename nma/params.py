@@ -129,14 +129,15 @@ class ParamSpace:
                 bad |= (values < low - tolerance) | (values > high + tolerance)
             if bad.any():
                 row = int(np.nonzero(bad.any(axis=1))[0][0])
+                where = f" of material {row}" if len(p) > 1 else ""
+                found = ", ".join(f"{x:.9g}" for x in values[row])
                 hint = (
                     f"; an adapter only knows its {bounds} range, clamp to it if that is meant"
                     if bounds == "training"
                     else ""
                 )
                 raise ParamError(
-                    f"{param.name} ({param.symbol}) of material {row} is {values[row].tolist()}, "
-                    f"allowed is {low:g} .. {high:g}{hint}"
+                    f"{param.name} ({param.symbol}){where} is {found}, allowed is {low:g} .. {high:g}{hint}"
                 )
         return np.clip(p, *self.columns(bounds))
 

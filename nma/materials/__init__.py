@@ -29,6 +29,7 @@ TEXTURE_OPTIONS = ("texture", "raw", "channel", "scale", "offset", "uv_scale")
 # A material is a page of text; a larger file is something else.
 MAX_BYTES = 1 << 20
 
+_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # .05, which TOML does not take for a number
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -118,13 +119,18 @@ def _document(path: Path) -> Mapping[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise MaterialError(f"{path}: more than {MAX_BYTES:,} bytes are no material file")
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise MaterialError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise MaterialError(f"{path} is no TOML file: {error}") from error
+    try:
+        return tomllib.loads(text)
     except RecursionError:
         raise MaterialError(f"{path} is no material file: its lists or tables nest too deep") from None
-    except ValueError as error:  # of TOML, of UTF-8, or of a number that has too many digits
-        raise MaterialError(f"{path} is no TOML file: {one_line(str(error))}") from error
+    except ValueError as error:  # of TOML, or of a number that has too many digits
+        hint = "; numbers begin with a digit, 0.05" if _BARE_POINT.search(text) else ""
+        raise MaterialError(f"{path} is no TOML file: {one_line(str(error))}{hint}") from error
 
 
 def _parse(document: Mapping[str, Any], path: Path) -> Material:
