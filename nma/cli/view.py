@@ -123,7 +123,7 @@ def render(
     """
     pictures = _outputs(output or Path("out", Path(subject).stem + ".png"))
     files.try_file(*pictures)
-    pixels = _pixels(size) if size else None
+    pixels = _pixels(size) if size is not None else None
     if subject.endswith(".xml"):
         _refuse(context, _MATERIAL_ONLY, "an XML scene")
         scene, own_spp = _load_file(subject, define, pixels, variant)
