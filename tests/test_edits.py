@@ -186,6 +186,23 @@ def refused(function, message):
     assert message in "\n".join(causes)
 
 
+WRONG_AT_LOAD = {
+    "nma": lambda adapter: adapter | {"sigma_t": "thick"},
+    "layered": lambda adapter: LAYERED | {"sigma_t": -1.0},
+    "values": lambda adapter: {"type": "values", "file": "nowhere.npz"},
+}
+
+
+@pytest.mark.parametrize("kind", WRONG_AT_LOAD)
+def test_what_was_refused_does_not_stop_other_scenes(adapter, kind):
+    """Although the error, which notebooks keep, has a hold on it."""
+    expected = picture(scene(LAYERED))
+    with pytest.raises(RuntimeError) as error:
+        mi.load_dict(WRONG_AT_LOAD[kind](adapter))
+    np.testing.assert_array_equal(picture(scene(LAYERED)), expected)
+    assert error.value.__traceback__ is not None
+
+
 WRONG = {
     "a number": ({}, "sigma_t", -1.0, "sigma_t is -1"),
     "a colour": ({}, "albedo", mi.Color3f(0.5, 3.0, 0.5), "albedo is 0.5, 3, 0.5"),
@@ -214,6 +231,41 @@ def test_wrong_edits_are_refused_and_not_rendered(adapter, kind, what):
     refused(params.update, message)
     np.testing.assert_array_equal(params[key], good)
     np.testing.assert_allclose(picture(loaded), before, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", BESIDE)
+def test_of_several_edits_the_wrong_ones_are_undone(adapter, kind):
+    """All of them, while the others show."""
+    bsdf = BESIDE[kind](adapter)
+    bsdf = bsdf if "layered" in kind else bsdf | {"clamp": False}
+    loaded = scene(bsdf)
+    params, edited = mi.traverse(loaded), {"alpha_top": -1.0, "sigma_t": 0.9, "eta_top": 99.0}
+    before = {name: np.array(params[f"ball.bsdf.{name}"]) for name in edited}
+    for name, value in edited.items():
+        params[f"ball.bsdf.{name}"] = value
+    refused(params.update, "alpha_top is -1")
+    for name in ("alpha_top", "eta_top"):
+        np.testing.assert_array_equal(params[f"ball.bsdf.{name}"], before[name])
+    expected = picture(scene(bsdf | {"sigma_t": 0.9}))
+    np.testing.assert_allclose(picture(loaded), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_what_frozen_functions_set_is_rendered_within_bounds(adapter):
+    """Afterwards too: the picture is that of the nearest value, whoever renders."""
+    loaded = scene(adapter | {"clamp": False})
+    params = mi.traverse(loaded)
+
+    @dr.freeze
+    def render(loaded, params, value):
+        params["ball.bsdf.sigma_t"] = value
+        params.update()
+        return mi.render(loaded, spp=16)
+
+    expected = picture(scene(adapter | {"sigma_t": 1.0}))
+    for value in (0.5, 5.0):
+        found = np.array(render(loaded, params, dr.opaque(mi.Float, value)))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(picture(loaded), expected, rtol=1e-4, atol=1e-5)
 
 
 def shared_key(params, leaf):

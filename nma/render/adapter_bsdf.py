@@ -41,7 +41,6 @@ def define() -> type:
 
     class Nma(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
             self.name = str(props.get("adapter", DEFAULT_ADAPTER))
             # Weights lie beside the scene, as the files of Mitsuba's own plugins do.
             self.adapter = load_once(
@@ -50,6 +49,7 @@ def define() -> type:
             self.inputs = of_adapter(self.adapter, props)
             self._curves = self._make_curves()
             self._recorded = _Recorded()
+            super().__init__(props)
             flags = [mi.BSDFFlags.Anisotropic] if self.adapter.anisotropic else []
             self._declare(*flags, *([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
 
@@ -57,9 +57,11 @@ def define() -> type:
             self.inputs.traverse(callback)
 
         def parameters_changed(self, keys: Any = ()) -> None:
-            self.inputs.changed()
-            if self._curves is not None:
-                self._curves.update(self.inputs.columns())
+            try:
+                self.inputs.changed()
+            finally:  # what was refused is undone, but the rest is edited
+                if self._curves is not None:
+                    self._curves.update(self.inputs.columns())
 
         def to_string(self) -> str:
             return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"

@@ -22,6 +22,8 @@ def define_base() -> type:
 
     A BSDF of ours has `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`), these are
     what `mi.traverse` and attributes show.
+    Its `__init__` calls the one here when nothing can fail any more: from then on Dr.Jit knows the BSDF and calls it in
+    all scenes, for as long as a traceback, say, keeps it.
     """
     import mitsuba
 

@@ -49,7 +49,7 @@ class Inputs:
         self.values = {param.name: _value(param, given[param.name]) for param in space.params}
         self.chosen = {param.name: _channel(param, props, self.values[param.name]) for param in space.params}
         self._seen = {name: _Seen(value) for name, value in self.values.items()}
-        self.check()
+        self.check(numbers=True)
 
     @property
     def textured(self) -> tuple[str, ...]:
@@ -88,32 +88,41 @@ class Inputs:
     def __str__(self) -> str:
         return ",\n".join(f"  {name} = {value}".replace("\n", "\n  ") for name, value in self.values.items())
 
-    def check(self) -> None:
-        """Checks the inputs that were changed since they were checked last. Raises `ParamError`, `TextureError`, and
-        puts back what was there: Dr.Jit records all BSDFs that there are, so one in error would stop other scenes, too.
+    def check(self, numbers: bool = False) -> None:
+        """Checks the textures, and with `numbers` all inputs, that were changed since they were checked last. Raises
+        `ParamError`, `TextureError`, and puts back what was there: Dr.Jit records all BSDFs that there are, so one in
+        error would stop other scenes, too.
 
         Called wherever inputs are used as well: Mitsuba does not tell of edits of a texture that several BSDFs share. A
-        frozen function that is being recorded knows no values; what it sets is moved within bounds.
+        frozen function knows no values; what it sets is moved within bounds.
         """
         import drjit as dr
-        import mitsuba as mi
 
         if dr.flag(dr.JitFlag.FreezingScope):
             return
-        for param in self.space.params:
-            seen, value = self._seen[param.name], self.values[param.name]
-            if not seen.changed():
-                continue
-            allowed = Allowed(param, self.bounds, self.clamp)
-            try:
-                if isinstance(value, mi.Texture):
-                    check_texture(allowed, value, seen.leaves(), self.chosen[param.name])
-                else:
-                    check_numbers(allowed, value)
-            except (ParamError, TextureError):
-                seen.put_back()
-                raise
-            seen.remember()
+        textured = self.textured
+        faults = [self._fault(param) for param in self.space.params if numbers or param.name in textured]
+        for fault in filter(None, faults):
+            raise fault
+
+    def _fault(self, param: Param) -> ParamError | TextureError | None:
+        """What is wrong with an input that was changed; it is undone then, else remembered."""
+        import mitsuba as mi
+
+        seen, value = self._seen[param.name], self.values[param.name]
+        if not seen.changed():
+            return None
+        allowed = Allowed(param, self.bounds, self.clamp)
+        try:
+            if isinstance(value, mi.Texture):
+                check_texture(allowed, value, seen.leaves(), self.chosen[param.name])
+            else:
+                check_numbers(allowed, value)
+        except (ParamError, TextureError) as error:
+            seen.put_back()
+            return error
+        seen.remember()
+        return None
 
     def changed(self, names: Iterable[str] = ()) -> None:
         """Takes note of edits in place of those that `names` start with, and checks them."""
@@ -123,7 +132,7 @@ class Inputs:
         for value in self.values.values():
             if not isinstance(value, mi.Texture):
                 dr.make_opaque(value)  # Mitsuba sets literals, which would be compiled into the kernel
-        self.check()
+        self.check(numbers=True)
 
 
 def of_adapter(adapter: Adapter, props: Any) -> Inputs:

@@ -38,8 +38,8 @@ def define() -> type:
 
     class Layered(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
             self.inputs = Inputs(LAYERED3, props)
+            super().__init__(props)
             self._declare(*([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
 
         def traverse(self, callback: mi.TraversalCallback) -> None:

@@ -52,8 +52,8 @@ def define() -> type:
 
     class ValuesBsdf(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
             self.values = _IN_MEMORY[int(props["source"])] if "source" in props else self._read(props)
+            super().__init__(props)
             self._declare(*([] if self.values.isotropic else [mi.BSDFFlags.Anisotropic]))
 
         @staticmethod
