@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from material_cases import PLAIN
 
 from nma import cli, llvm
 
@@ -72,3 +73,16 @@ def nma(monkeypatch, capsys):
         return end.value.code or 0, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture
+def material_file(tmp_path):
+    """Writes a material file, PLAIN with some text replaced, and returns its path."""
+
+    def write(old: str = "", new: str = "") -> Path:
+        assert old in PLAIN
+        path = tmp_path / "test.toml"
+        path.write_text(PLAIN.replace(old, new, 1))
+        return path
+
+    return write
