@@ -244,6 +244,8 @@ def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
         ({"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo holds 1.5, one of 1"),
         ({"sigma_t": COLOUR}, "sigma_t wants one number or a texture, got the colour 0.1, 0.5, 0.9"),
         ({"sigma_t": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}, None),
+        ({"albedo": [0.1, 0.5, 0.9]}, None),
+        ({"albedo": [0.1, 1.5, 0.9]}, "albedo is 1.5, allowed is 0 .. 1"),
         ({"sigma_t": shared}, "the texture of sigma_t is coloured"),
         ({"sigma_t": shared, "sigma_t_channel": "b"}, None),
         ({"sigma_t": bitmap(7.0), "clamp": True}, None),

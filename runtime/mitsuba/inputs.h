@@ -149,6 +149,9 @@ private:
         }
         if (type == Type::Color) {
             input.shown = props.get<Colour>(p.name);
+        } else if (type == Type::Vector) {
+            const auto numbers = props.get<Vector3f>(p.name);
+            input.shown = Colour(numbers.x(), numbers.y(), numbers.z());
         } else {
             input.texture = props.get_unbounded_texture<Texture>(p.name);
             if (type != Type::Spectrum) return input;
