@@ -35,6 +35,7 @@ def interactions(n, cosine):
     return si
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_albedo_is_that_of_samples(kind):
     description, error = KINDS[kind]

@@ -223,6 +223,7 @@ def test_compare_two_images(nma, tmp_path):
     assert "flip_hdr" in nma("compare", a, b)[1]
 
 
+@pytest.mark.slow
 def test_compare_a_material_with_its_reference(nma, weights):
     options = ("--adapter", weights, "--size", 16, "--spp", 2, "--json")
     code, out, err = nma("compare", "gold-red-lacquer", *options)
@@ -230,6 +231,7 @@ def test_compare_a_material_with_its_reference(nma, weights):
     assert tuple(json.loads(out)["noise"]) == tuple(json.loads(out))[:-1]
 
 
+@pytest.mark.slow
 def test_demo_draws_two_rows_and_prints_six_lines(nma, weights, tmp_path, monkeypatch):
     """And needs no library for SSIM, which would take longest to install."""
     monkeypatch.setitem(sys.modules, "skimage", None)

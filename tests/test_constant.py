@@ -47,6 +47,7 @@ def fit(coated) -> Constant:
 # ---- The fit ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_principled_brdf_is_recovered_from_its_table(fit):
     assert fit.log_loss < 0.0005
     assert fit.log_loss == fit.figures["log_loss"] == fit.adapter.training["log_loss"]
@@ -64,6 +65,7 @@ def test_the_best_of_several_fits_has_the_least_error_of_values_and_albedo(fit):
     assert fit.brightness == pytest.approx(1.0, abs=0.005)
 
 
+@pytest.mark.slow
 def test_what_the_log_loss_leaves_out_is_not_left_dark():
     """Copper under a blue medium and a smooth coat. By log loss alone it became 14 % too dark, albedo error .076."""
     changes = {
@@ -167,6 +169,7 @@ def fitted(fit, monkeypatch) -> list[tuple]:
     return given
 
 
+@pytest.mark.slow
 def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monkeypatch, tmp_path):
     """The same as `fit_constant` finds: equal arguments give equal results, and a class without parameters will do."""
     monkeypatch.setattr("nma.train.constant.CONSTANT", SHORT)

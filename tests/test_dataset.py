@@ -104,6 +104,7 @@ def test_two_workers_write_one_dataset(whole, tmp_path):
     assert chunks(path) == chunks(whole.path)
 
 
+@pytest.mark.slow
 def test_a_run_killed_three_times_and_resumed_equals_an_uninterrupted_one(whole, tmp_path):
     """SIGKILL, at random moments after some more materials are done."""
     path, moments, missing = tmp_path / "killed.zarr", random.Random(1), 24

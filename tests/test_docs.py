@@ -64,6 +64,7 @@ def test_there_are_blocks_in_every_page_about_python():
     assert {"README.md", "docs/mitsuba.md", "docs/python.md", "docs/materials.md", TRAINING} <= pages
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in PYTHON if name not in SLOW])
 def test_python_of_the_pages_runs(name, cheap):
     run_block(PYTHON[name], cheap)

@@ -154,6 +154,7 @@ def test_frozen_functions_follow_edits(adapter, kind):
     assert max(inside.n_recordings, frozen.n_recordings) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ("plain", "textured"))
 def test_frozen_functions_see_derivatives_of_numbers_set_before(adapter, kind):
     """They get the curves of a plain material and the number that these were made from side by side."""

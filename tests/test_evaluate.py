@@ -94,6 +94,7 @@ def elsewhere(n):
     return bins[(np.abs(bins[:, 0] - bins[:, 1]) > 1) | (bins[:, 2] < 37)].astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "slope"), [*((name, 1.0) for name in BLENDS), ("alpha .001", 0.0)])
 def test_the_stated_error_of_integration_is_honest(name, slope):
     """The log loss of two estimates' mean against fine integration, where lobes are sharp and where they are not."""

@@ -128,6 +128,7 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
         assert np.abs(expected).min() > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
     """Sampling makes both noisy: four standard errors over 8 seeds (false alarm .007 in all, by Student's t)."""
@@ -142,6 +143,7 @@ def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
         assert error < 0.1 * abs(expected.mean()), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("blended", (False, True), ids=("alone", "blended"))
 def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):

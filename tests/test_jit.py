@@ -81,6 +81,7 @@ def test_modules_take_dr_jit_from_the_gate():
         assert not own, f"{path}: {own}; write `from nma.jit import dr`"
 
 
+@pytest.mark.slow
 @needs_llvm
 @pytest.mark.usefixtures("compiler")
 def test_the_scalar_renderer_needs_no_library():

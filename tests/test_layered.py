@@ -129,6 +129,7 @@ def test_evaluation_equals_walks(case):
     assert np.abs(z).max() < limit(z.size), f"z {np.abs(z).max():.1f} beyond {limit(z.size):.1f}"
 
 
+@pytest.mark.slow
 def test_evaluation_equals_walks_of_random_materials():
     params = LAYERED3.sample(np.random.default_rng(11), 6)
     named = [{p.name: row[LAYERED3.slices[p.name]] for p in LAYERED3.params} for row in params]

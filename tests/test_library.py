@@ -133,6 +133,7 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(made, tables, tmp_path,
         training.train_library(NAMES, tables[:3], TINY, {"data": "others"}, checkpoint=checkpoint)
 
 
+@pytest.mark.slow
 def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
     layers = [(matrix.copy(), bias.copy()) for matrix, bias in library.adapter.layers]
     found = training.encode(library, tables[3:], recipe=CODING)

@@ -46,6 +46,7 @@ def test_the_studio_has_no_small_bright_light_and_a_dark_horizon():
     assert np.median(image[(up > 0.0) & (up < 0.05)]) < 0.05 < 0.2 < image[up > 0.9].min()
 
 
+@pytest.mark.slow
 def test_the_studio_leaves_weaker_fireflies_than_outdoors():
     """What pixels of a polished ball have beyond five times the converged picture, at 16 samples."""
     beyond = {}
@@ -98,6 +99,7 @@ def test_nearly_all_numbers_of_samples_can_be_multijittered():
     assert kinds.count("multijitter") > 490
 
 
+@pytest.mark.slow
 def test_multijittered_samples_leave_less_noise():
     converged = render("studio", 1024, size=32, seed=1, bsdf=GREY)
     error = {

@@ -85,6 +85,7 @@ def compound_poisson(rng, mean, quantum, shape):
     return total * quantum
 
 
+@pytest.mark.slow
 def test_the_huber_loss_seeks_the_mean_of_noisy_bins_and_the_log_loss_their_median():
     """A matte target whose brightness is all there is to fit, against sparse bins of the same brightness."""
     rng, quantum = np.random.default_rng(6), 0.2
@@ -148,6 +149,7 @@ def exact_albedo(raw, mu):
     return np.array([(c.mean(axis=1) * weights).sum() * math.pi for c in value])
 
 
+@pytest.mark.slow
 def test_albedos_and_their_derivatives_are_unbiased(tables):
     """t-tests against quadrature and its differences; the halves' product has the square of the albedo as its mean."""
     blocks, rows = 40, 32

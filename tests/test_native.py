@@ -14,6 +14,7 @@ def cache():
     return plugins()
 
 
+@pytest.mark.slow
 def test_what_is_built_is_not_built_again(cache):
     said = []
     assert native.build_mitsuba(said.append) == cache

@@ -80,6 +80,7 @@ def test_values_out_of_the_gamut_are_moved_there_and_others_refused():
         pool_of(broken)
 
 
+@pytest.mark.slow
 def test_a_fit_finds_a_principled_brdf():
     """One layer of 16 and 400 steps are enough where the target can be the source."""
     source = Formula(lambda wi, wo: eval_principled(PLASTIC, wi, wo), name="plastic")
@@ -106,6 +107,7 @@ def test_an_anisotropic_fit_knows_azimuths(tmp_path):
     assert found < 0.2 * compare(loaded, turned, pairs)["log_loss"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "grid",
     [

@@ -86,6 +86,7 @@ def test_density_and_samples_are_those_of_the_package(bridge):
             assert (np.abs(found[:, :3] - expected).max(axis=1) < 1e-3)[valid].mean() > 0.998
 
 
+@pytest.mark.slow
 def test_samples_follow_the_density(bridge):
     """Chi-square tests; a correct sampler fails one of them with a chance of 1e-3."""
     rng, tests = np.random.default_rng(1), len(CASES) * 2

@@ -12,6 +12,8 @@ ROOT = Path(__file__).parent.parent
 RUNTIME = ROOT / "runtime"
 WEIGHTS = [ROOT / f"nma/adapters/{name}.safetensors" for name in ("layered3-5x64", "layered3-3x32")]
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-pthread", f"-I{RUNTIME}"]
+# The second compiler, and most of what follows, waits for `make test-all`.
+COMPILERS = ["g++", pytest.param("clang++", marks=pytest.mark.slow)]
 ARM, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64-static"
 
 
@@ -43,7 +45,7 @@ def output(*words, **options):
     return run.stderr if options.get("code") else run.stdout
 
 
-@pytest.mark.parametrize("compiler", ["g++", "clang++"])
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_example_compiles_and_runs(compiler, tmp_path):
     assert len((RUNTIME / "example.cpp").read_text().splitlines()) < 100
     program = built(compiler, "example.cpp", tmp_path, "-O2")
@@ -65,7 +67,7 @@ def test_the_example_of_the_simulated_material_agrees_with_itself(tmp_path):
 
 
 @pytest.mark.parametrize("standard", ["17", "20", "2b"])
-@pytest.mark.parametrize("compiler", ["g++", "clang++"])
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_every_header_compiles_in_newer_standards(compiler, standard):
     headers = ["-include", "nma/layered.h", "-include", "nma/classes.h"]
     without = ["-DNMA_NO_AVX512_BF16"] if standard == "17" else []
@@ -92,7 +94,8 @@ int main(int, char** words) {
 """
 
 
-@pytest.mark.parametrize("compiler", ["g++", "clang++"])
+@pytest.mark.slow
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_fast_math_refuses_numbers_that_are_not_finite(compiler, tmp_path):
     """Compilers that take every number for finite drop std::isfinite."""
     source, program, path = (tmp_path / name for name in ("finite.cpp", "finite", "bad.safetensors"))
@@ -104,19 +107,21 @@ def test_fast_math_refuses_numbers_that_are_not_finite(compiler, tmp_path):
         assert output(program, path) == wanted
 
 
-@pytest.mark.parametrize("compiler", ["g++", "clang++"])
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_instruction_sets_agree(compiler, weights, tmp_path):
     program = built(compiler, "tests/compare.cpp", tmp_path, "-O2")
     for path in weights:
         assert "portable" in output(program, path)
 
 
+@pytest.mark.slow
 def test_neon_agrees_under_emulation(weights, tmp_path):
     program = built(ARM, "tests/compare.cpp", tmp_path, "-O2", "-static")
     for path in weights:
         assert "neon" in output(tool(EMULATOR), program, path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sanitizer", ["address,undefined", "thread"])
 def test_sanitizers_find_nothing(sanitizer, tmp_path):
     flags = ["-O0", f"-fsanitize={sanitizer}", "-fno-sanitize-recover=all"]
@@ -131,6 +136,7 @@ def test_a_million_calls_are_sound(weights, tmp_path):
         assert ", 0 faults" in output(program, 1_000_000, path)
 
 
+@pytest.mark.slow
 def test_damaged_files_load_or_are_refused(weights, tmp_path):
     flags = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/fuzz.cpp", tmp_path, *flags)

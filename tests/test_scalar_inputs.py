@@ -10,6 +10,9 @@ from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 from nma.image_io import write_exr, write_png
 
+# Each compiles plugins or renders in processes of its own.
+pytestmark = [pytest.mark.slow]
+
 
 @pytest.fixture(scope="module", autouse=True)
 def cache():

@@ -11,6 +11,9 @@ import pytest
 from adapter_cases import random_anisotropic_adapter
 from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
+# Each compiles plugins or renders in processes of its own.
+pytestmark = [pytest.mark.slow]
+
 TEXTURED = MATERIAL | {
     "albedo": CHECKS,
     "alpha_bottom": {"type": "checkerboard", "color0": 0.1, "color1": 0.4},

@@ -138,6 +138,7 @@ def test_nma_render_wants_a_material_for_the_adapter_of_a_class(nma, tmp_path):
     assert "adapter of the whole class layered3; name a material, too: nma render MATERIAL --adapter" in err
 
 
+@pytest.mark.slow
 def test_nma_compare_renders_the_simulation_of_the_material_that_an_adapter_knows(nma, weights, tmp_path):
     options = ("--size", "16", "--spp", "2", "--json")
     alone = nma("compare", weights, *options)

@@ -208,6 +208,7 @@ def test_ten_million_evaluations_are_finite_and_not_negative():
     assert dr.all((pdf > 0) | (value.x + value.y + value.z == 0))
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_everywhere():
     """Extreme raw outputs and degenerate pairs of directions; derivatives to everything, in single precision."""
     rng = np.random.default_rng(16)

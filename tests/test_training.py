@@ -45,6 +45,7 @@ def tables():
     return lambertian(6)
 
 
+@pytest.mark.slow
 def test_a_run_repeats_bit_for_bit(tables):
     """The first 200 losses, and more, with the same seed; other ones with another seed."""
     first, run = training.train_class(LAYERED3, TINY, tables, {})
@@ -153,6 +154,7 @@ def test_the_paper_s_preset_runs(tables):
     assert network.parameters(adapter.layers) == 7159 - 3200 - 19 * 32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("instances", "directional"), [(1, False), (2, False), (1, True), (2, True), (5, True)], ids=str
 )
