@@ -56,6 +56,7 @@ def test_a_principled_brdf_is_recovered_from_its_table(fit):
         assert getattr(fit.principled, name) == pytest.approx(getattr(RED, name), abs=0.06), name
 
 
+@pytest.mark.slow
 def test_the_best_of_several_fits_has_the_least_error_of_values_and_albedo(fit):
     record = fit.adapter.training
     starts = record["log_loss_of_starts"]
@@ -82,6 +83,7 @@ def test_what_the_log_loss_leaves_out_is_not_left_dark():
     assert fit.figures["albedo_error"] < 0.05
 
 
+@pytest.mark.slow
 def test_the_fit_is_an_adapter_that_can_be_saved(fit, coated, tmp_path):
     fit.adapter.save(tmp_path / "red.safetensors")
     loaded = Adapter.load(tmp_path / "red.safetensors")
@@ -180,6 +182,7 @@ def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monke
     assert f"log loss {fit.log_loss:.5f}" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("brightness", "words"), [(0.8, "20.0 % too dark"), (1.1, "10.0 % too bright")])
 def test_numbers_that_cannot_show_the_material_come_with_a_warning(
     nma, fit, red, monkeypatch, tmp_path, brightness, words
@@ -195,6 +198,7 @@ def test_numbers_that_cannot_show_the_material_come_with_a_warning(
     assert f"warning: an albedo error of 0.1280 is above 0.05 ({words} in all)" in err
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_mitsuba_loads(nma, fit, fitted, red, tmp_path):
     red.save(tmp_path / "red.npz")
     folder = tmp_path / "new"
@@ -212,6 +216,7 @@ def test_the_command_writes_what_mitsuba_loads(nma, fit, fitted, red, tmp_path):
         np.testing.assert_array_equal(a.numpy(), b.numpy())
 
 
+@pytest.mark.slow
 def test_named_materials_values_and_tables_are_sources(nma, fitted, red, monkeypatch, tmp_path):
     monkeypatch.setattr("nma.tabulation.POINTS", 16)
     xml, both, networks = tmp_path / "red.xml", tmp_path / "both.npz", tmp_path / "networks.npz"

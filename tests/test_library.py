@@ -277,6 +277,7 @@ def test_tables_are_kept_until_their_file_changes(folder, tmp_path, monkeypatch)
     assert len(made) == 5
 
 
+@pytest.mark.slow
 def test_the_commands(nma, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "RECIPE", TINY)
     monkeypatch.setattr(training, "ENCODING", CODING)

@@ -9,7 +9,7 @@ from nma import encoding, native, network
 from nma.errors import MissingDependencyError
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(scope="module")
 def cache():
     return plugins()
 
@@ -71,6 +71,7 @@ def test_a_failed_build_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_python_reaches_the_batched_kernel(tmp_path):
     from nma.runtime import Runtime, available
 
