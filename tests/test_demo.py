@@ -1,5 +1,6 @@
 """The demonstration: pictures at once, figures when there are some."""
 
+import pytest
 from adapter_cases import random_adapter
 
 import nma.render
@@ -10,6 +11,7 @@ from nma.render.demo import Settings, total_samples
 nma.render.use("llvm_ad_rgb")
 
 
+@pytest.mark.slow
 def test_the_sheet_is_written_before_anything_is_measured_and_anew_with_figures(tmp_path, monkeypatch):
     random_adapter(hidden="1x8").save(tmp_path / "tiny.safetensors")
     settings = Settings((16, 16), 4, 2, 4, str(tmp_path / "tiny.safetensors"))

@@ -117,7 +117,7 @@ def case(name, folder):
     return bsdf, directions
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ("plain", pytest.param("textured", marks=pytest.mark.slow)))
 def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
     """With one point light nothing is random but the place in the pixel, the same on all sides."""
     bsdf, directions = case(name, tmp_path)

@@ -231,6 +231,7 @@ def test_samples_have_the_values_and_densities_of_eval():
     np.testing.assert_allclose(pdf[valid], density[valid], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_samples_follow_the_density():
     """Chi-square tests of six materials; a correct sampler fails one of them with a chance of 1e-3. For lobes of any
     width, and in double precision, tests/test_target_sampling.py tests the functions that this runtime repeats."""

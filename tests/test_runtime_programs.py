@@ -107,6 +107,7 @@ def test_fast_math_refuses_numbers_that_are_not_finite(compiler, tmp_path):
         assert output(program, path) == wanted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_instruction_sets_agree(compiler, weights, tmp_path):
     program = built(compiler, "tests/compare.cpp", tmp_path, "-O2")
