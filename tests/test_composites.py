@@ -189,7 +189,8 @@ def scores(found, bsdfs):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_composites_are_linear_combinations(bsdfs, integrator):
     sheet = cells(bsdfs)
-    found = measured(sheet_scene(sheet, INTEGRATORS[integrator]), sheet)
+    scene = sheet_scene(sheet, INTEGRATORS[integrator])
+    found = measured(scene, sheet)
     differences = scores(found, bsdfs)
     limit = norm.isf(0.5 * FALSE_ALARM / sum(map(len, differences.values())))
     off = {name: z.round(1) for name, z in differences.items() if np.abs(z).max() > limit}
@@ -208,3 +209,20 @@ def test_composites_render_where_value_and_sample_are_asked_apart(bsdfs, name):
     picture = np.array(mi.render(sheet_scene(sheet, INTEGRATORS["direct"]), spp=4))
     assert np.isfinite(picture).all()
     assert picture.mean() > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_composites_can_be_frozen(bsdfs, integrator):
+    """Recorded once by `dr.freeze`, the sheet is the same picture."""
+    bsdfs = {name: bsdfs[name] for name in ("nma, textured", "layered", "values")}
+    loaded = sheet_scene(cells(bsdfs), INTEGRATORS[integrator])
+    film = {"type": "hdrfilm", "width": 32, "height": 32}
+    look = mi.ScalarTransform4f().look_at([4, -18, 20], [4, 2, 0], [0, 0, 1])
+    # Mitsuba's orthographic sensor cannot be frozen.
+    sensor = mi.load_dict({"type": "perspective", "fov": 20, "to_world": look, "film": film})
+    frozen = dr.freeze(lambda loaded, sensor: mi.render(loaded, sensor=sensor, spp=8))
+    expected = np.array(mi.render(loaded, sensor=sensor, spp=8))
+    for _ in range(2):
+        np.testing.assert_allclose(np.array(frozen(loaded, sensor)), expected, rtol=1e-4, atol=1e-5)
+    assert frozen.n_recordings == 1

@@ -173,10 +173,32 @@ def _registered() -> list[Any]:
 
 
 def _inside_blends(everything: list[Any]) -> set[int]:
-    import mitsuba as mi
-
-    inside = set()
+    inside: set[int] = set()
     for bsdf in everything:
         if bsdf.class_name() not in _HAND_ON:
-            inside |= {_serial(part) for part in mi.traverse(bsdf).hierarchy if part is not bsdf}
+            inside |= {_serial(part) for part in _parts(bsdf)}
     return inside
+
+
+def _parts(bsdf: Any) -> list[Any]:
+    """The BSDFs inside of one, at all levels. Textures are not looked into: a coloured one works out its pixels when it
+    is, and while Dr.Jit records these would be symbolic ever after."""
+    import mitsuba
+
+    mi: Any = mitsuba  # its types change with the variant
+    found: list[Any] = []
+
+    class Parts(mi.TraversalCallback):
+        def put(self, name, value, flags, cpptype=None):
+            self.put_object(name, value, flags)
+
+        def put_value(self, name, value, flags, cpptype=None):
+            pass
+
+        def put_object(self, name, value, flags):
+            if isinstance(value, mi.BSDF):
+                found.append(value)
+                value.traverse(Parts())  # nanobind calls no method of an object within itself
+
+    bsdf.traverse(Parts())
+    return found
