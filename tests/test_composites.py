@@ -3,6 +3,8 @@
 One sheet of small cells under the same sky is rendered for each integrator, one cell for each BSDF in each composite.
 """
 
+import gc
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -36,6 +38,7 @@ INTEGRATORS = {
 @pytest.fixture(autouse=True)
 def _variant():
     nma.render.use("llvm_ad_rgb")
+    gc.collect()  # Dr.Jit records the BSDFs of scenes that wait for it, too
 
 
 @pytest.fixture(scope="module")
