@@ -18,7 +18,7 @@ demo:
 test: lint
 	$(PYTEST) $(ARGS)
 
-# One session, so that its summary is the last that is printed.
+# One run of pytest, so that its summary is the last that is printed.
 test-all: lint types
 	$(PYTEST) -m "slow or not slow" $(ARGS)
 
