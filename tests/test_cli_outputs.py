@@ -105,10 +105,10 @@ def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, mo
 
 def test_errors_of_the_system_elsewhere_are_one_line(nma, monkeypatch):
     def no_folder():
-        raise PermissionError(errno.EACCES, "Permission denied", "/root/cache")
+        raise PermissionError(errno.EACCES, "Permission denied", "/locked/cache")
 
     monkeypatch.setattr("nma.native.build_mitsuba", lambda say: no_folder())
-    assert nma("mitsuba", "build") == (1, "", "nma: /root/cache: Permission denied\n")
+    assert nma("mitsuba", "build") == (1, "", "nma: /locked/cache: Permission denied\n")
 
 
 @pytest.mark.parametrize(

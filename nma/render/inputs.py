@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -124,8 +123,8 @@ class Inputs:
         seen.remember()
         return None
 
-    def changed(self, names: Iterable[str] = ()) -> None:
-        """Takes note of edits in place of those that `names` start with, and checks them."""
+    def changed(self) -> None:
+        """Takes note of edits in place, and checks them. Raises what `check` does."""
         import drjit as dr
         import mitsuba as mi
 
