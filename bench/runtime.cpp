@@ -35,7 +35,8 @@ double best(F all, int repetitions = REPETITIONS) {
 }
 
 void report(const std::string& network, const std::string& what, const char* set, double nanoseconds) {
-    std::printf("{\"network\": \"%s\", \"what\": \"%s\", \"set\": \"%s\", \"ns\": %.2f}\n", network.c_str(), what.c_str(), set, nanoseconds);
+    std::printf("{\"network\": \"%s\", \"what\": \"%s\", \"set\": \"%s\", \"ns\": %.2f}\n", network.c_str(),
+                what.c_str(), set, nanoseconds);
 }
 
 struct Queries {
@@ -49,7 +50,8 @@ struct Queries {
             for (const nma::SourceParam& p : adapter.parameters())
                 for (int c = 0; c < p.size; ++c) {
                     const float low = static_cast<float>(p.low), high = static_cast<float>(p.high);
-                    parameters.push_back(p.logarithmic ? low * std::pow(high / low, u(engine)) : low + (high - low) * u(engine));
+                    parameters.push_back(p.logarithmic ? low * std::pow(high / low, u(engine))
+                                                       : low + (high - low) * u(engine));
                 }
             cosines.push_back(0.02f + 0.98f * u(engine));
             wi.push_back(direction(cosines.back(), u(engine)));
@@ -109,7 +111,8 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
 }
 
 // A network alone, of zeros, on one query after the other and on all together.
-void time_network(const std::string& name, const std::vector<int>& sizes, nma::InstructionSet set, bool compact, int repetitions = REPETITIONS) {
+void time_network(const std::string& name, const std::vector<int>& sizes, nma::InstructionSet set, bool compact,
+                  int repetitions = REPETITIONS) {
     std::vector<nma::Layer> layers;
     double products = 0.0;
     for (std::size_t k = 0; k + 1 < sizes.size(); ++k) {
@@ -130,7 +133,8 @@ void time_network(const std::string& name, const std::vector<int>& sizes, nma::I
     }, repetitions));
     const double many = best([&] { network.forward_many(QUERIES, inputs.get(), outputs.get()); }, repetitions);
     report(name, "network, batch", label.c_str(), many);
-    std::printf("{\"network\": \"%s\", \"what\": \"multiply-adds per ns, batch\", \"set\": \"%s\", \"ns\": %.2f}\n", name.c_str(), label.c_str(), products / many);
+    std::printf("{\"network\": \"%s\", \"what\": \"multiply-adds per ns, batch\", \"set\": \"%s\", \"ns\": %.2f}\n",
+                name.c_str(), label.c_str(), products / many);
 }
 
 #ifdef HAS_EIGEN
@@ -174,7 +178,9 @@ NMA_TARGET("avx512f,fma") double peak_avx512() {
     for (int k = 0; k < 20; ++k) {
         constexpr long STEPS = 200000;
         const double began = seconds();
-        for (long n = 0; n < STEPS; ++n) NMA_UNROLL for (int i = 0; i < 12; ++i) sums[i] = _mm512_fmadd_ps(sums[i], factor, step);
+        for (long n = 0; n < STEPS; ++n) {
+            NMA_UNROLL for (int i = 0; i < 12; ++i) sums[i] = _mm512_fmadd_ps(sums[i], factor, step);
+        }
         most = std::max(most, STEPS * 12.0 * 16.0 / (seconds() - began) / 1e9);
     }
     for (auto& sum : sums) sink = _mm512_cvtss_f32(sum);
@@ -189,7 +195,8 @@ NMA_TARGET("avx512f,fma") double peak_avx512() {
 int main(int count, char** words) {
     using nma::InstructionSet;
     if (nma::supported(InstructionSet::avx512)) report("", "peak multiply-adds per ns", "avx512", peak_avx512());
-    const std::pair<const char*, std::vector<int>> networks[] = {{"5x64", {16, 64, 64, 64, 64, 64, 23}}, {"3x32", {16, 32, 32, 32, 23}}};
+    const std::pair<const char*, std::vector<int>> networks[] = {{"5x64", {16, 64, 64, 64, 64, 64, 23}},
+                                                                 {"3x32", {16, 32, 32, 32, 23}}};
     // A decoder of the size of Fan et al. 2022: 1.07 M numbers.
     const std::vector<int> large{38, 512, 512, 512, 512, 512, 3};
     for (const InstructionSet set : nma::INSTRUCTION_SETS) {

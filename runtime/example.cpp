@@ -28,7 +28,8 @@ int main(int count, char** words) {
             nma::Vec3<double> sum{0.0, 0.0, 0.0};
             for (int k = 0; k < SAMPLES; ++k) {
                 const nma::Sampled s = material.sample(wi, uniform(engine), uniform(engine), uniform(engine));
-                if (s.pdf > 0.0f) sum = sum + nma::Vec3<double>{s.value.x / s.pdf, s.value.y / s.pdf, s.value.z / s.pdf};
+                if (s.pdf > 0.0f)
+                    sum = sum + nma::Vec3<double>{s.value.x / s.pdf, s.value.y / s.pdf, s.value.z / s.pdf};
             }
             const auto albedo = sum * (1.0 / SAMPLES);
             std::printf("%12.1f %6.3f %6.3f %7.3f\n", mu, albedo.x, albedo.y, albedo.z);

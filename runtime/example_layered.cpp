@@ -3,11 +3,11 @@
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered
 //
-// A walk leaves where the material sends it, and so seldom meets a small lamp; `evaluate` looks at the lamp, and so misses
-// what makes a narrow lobe bright. A path tracer does both and weighs each by the odds that the other finds the same light
-// (Veach 1997, eq. 9.8). That needs densities, and a walk has none in closed form; any will do, as long as both ways ask the
-// same: `pdf`, which is near the walk's, so that the weights are good. Samples that are recombined by densities, as in blends
-// and masks of materials, must follow the density to the letter: `sample` does.
+// A walk leaves where the material sends it, and so seldom meets a small lamp; `evaluate` looks at the lamp, and so
+// misses what makes a narrow lobe bright. A path tracer does both and weighs each by the odds that the other finds the
+// same light (Veach 1997, eq. 9.8). That needs densities, and a walk has none in closed form; any will do, as long as
+// both ways ask the same: `pdf`, which is near the walk's, so that the weights are good. Samples that are recombined by
+// densities, as in blends and masks of materials, must follow the density to the letter: `sample` does.
 #include <cstdio>
 
 #include "nma/layered.h"
@@ -50,7 +50,8 @@ int main() {
     const layered::Layers gold = layered::Layers::of(GOLD);
     const layered::Density density(gold, VIEW);
     layered::Random random(1, 1);
-    Estimate walks{"walks alone"}, lamp{"evaluate at the lamp alone"}, both{"both, weighed by pdf"}, exact{"sample, which follows pdf"};
+    Estimate walks{"walks alone"}, lamp{"evaluate at the lamp alone"}, both{"both, weighed by pdf"},
+        exact{"sample, which follows pdf"};
     constexpr int COUNT = 100000;
     for (int k = 0; k < COUNT; ++k) {
         const layered::Walk walk = layered::walk(gold, VIEW, random);
@@ -60,7 +61,9 @@ int main() {
         const Vec seen = layered::evaluate(gold, VIEW, wo, random) * (1.0f / LAMP_PDF);
 
         // Odds that a direction within the lamp came from the walk rather than from the lamp.
-        const auto odds = [&](const Vec& w) { return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF); };
+        const auto odds = [&](const Vec& w) {
+            return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF);
+        };
         walks.add(met);
         lamp.add(seen);
         both.add(met * odds(walk.direction) + seen * (1.0f - odds(wo)));
@@ -68,7 +71,8 @@ int main() {
         const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
         const layered::Drawn drawn = layered::sample(gold, density, VIEW, u_lobe, u1, u2);
         const bool reaches = drawn.pdf > 0.0f && lit(drawn.wo);
-        exact.add(reaches ? layered::evaluate(gold, VIEW, drawn.wo, random) * (1.0f / drawn.pdf) : Vec{0.0f, 0.0f, 0.0f});
+        exact.add(reaches ? layered::evaluate(gold, VIEW, drawn.wo, random) * (1.0f / drawn.pdf)
+                          : Vec{0.0f, 0.0f, 0.0f});
     }
     std::puts("luminance that the material sends to the viewer");
     for (const Estimate* e : {&walks, &lamp, &both, &exact}) e->print(COUNT);

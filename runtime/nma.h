@@ -1,15 +1,15 @@
 // Neural Material Adapter: expensive materials rendered as blends of Principled BRDFs that a tiny network prepares.
 //
 //     const nma::Adapter adapter = nma::Adapter::load("layered3-5x64.safetensors");
-//     adapter.clamp(parameters);                                                 // or refuse them: adapter.check(parameters)
-//     const nma::Material at_hit = adapter.prepare(parameters, wi);              // once per shading point
-//     const nma::Value v = at_hit.eval(wi, wo);                                  // f cos(theta_o) [1/sr] and pdf [1/sr]
+//     adapter.clamp(parameters);                                         // or refuse them: adapter.check(parameters)
+//     const nma::Material at_hit = adapter.prepare(parameters, wi);      // once per shading point
+//     const nma::Value v = at_hit.eval(wi, wo);                          // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = at_hit.sample(wi, u_lobe, u1, u2);
 //
-// C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading and making
-// `Curves` allocate and throw `nma::Error`; everything else does neither and is safe to call from many threads at once.
-// Directions are unit vectors in the local frame, z up, `wi` towards the viewer, `wo` towards the light. Lobes of adapters
-// with `in_plane` parameters are stretched along the plane of incidence, which is found here.
+// C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading and
+// making `Curves` allocate and throw `nma::Error`; everything else does neither and is safe to call from many threads
+// at once. Directions are unit vectors in the local frame, z up, `wi` towards the viewer, `wo` towards the light. Lobes
+// of adapters with `in_plane` parameters are stretched along the plane of incidence, which is found here.
 #pragma once
 
 #include <cstddef>
@@ -43,13 +43,15 @@ public:
         return found;
     }
 
-    // Directional albedo at `wi`, what denoisers ask for: the mean over samples at fixed points (Roberts 2018, "R2"), at most 1.
+    // The directional albedo at `wi`, at most 1, which denoisers ask for: the mean over samples at fixed points
+    // (Roberts 2018, "R2").
     Vec3<float> albedo(const Direction& wi, int points = 128) const {
         const auto fraction = [](float x) { return x - std::floor(x); };
         Vec3<float> sum{0.0f, 0.0f, 0.0f};
         for (int k = 0; k < points; ++k) {
             const float n = static_cast<float>(k) + 0.5f;
-            const Sampled s = sample(wi, n / static_cast<float>(points), fraction(n * 0.75487767f), fraction(n * 0.56984029f));
+            const Sampled s =
+                sample(wi, n / static_cast<float>(points), fraction(n * 0.75487767f), fraction(n * 0.56984029f));
             if (s.pdf > 0.0f) sum = sum + s.value * (1.0f / s.pdf);
         }
         const float share = 1.0f / static_cast<float>(points);
@@ -70,8 +72,12 @@ private:
             const float length = std::sqrt(wi.x * wi.x + wi.y * wi.y);
             return wanted && length > 0.0f ? Plane{wi.x / length, wi.y / length} : Plane{1.0f, 0.0f};
         }
-        Direction enter(const Direction& v) const { return {cos_phi * v.x + sin_phi * v.y, cos_phi * v.y - sin_phi * v.x, v.z}; }
-        Direction leave(const Direction& v) const { return {cos_phi * v.x - sin_phi * v.y, sin_phi * v.x + cos_phi * v.y, v.z}; }
+        Direction enter(const Direction& v) const {
+            return {cos_phi * v.x + sin_phi * v.y, cos_phi * v.y - sin_phi * v.x, v.z};
+        }
+        Direction leave(const Direction& v) const {
+            return {cos_phi * v.x - sin_phi * v.y, sin_phi * v.x + cos_phi * v.y, v.z};
+        }
     };
 
     Blend<float> blend_;
@@ -82,8 +88,8 @@ private:
 struct Options {
     // All but avx512_bf16 compute in float32; that one halves a network's time by rounding activations to 8 bits.
     InstructionSet set = fastest();
-    // Rounds weights to bfloat16, which halves the memory that a query has to fetch. Both shipped adapters lost less than
-    // .00002 of log loss by it; avx512_bf16 always does it.
+    // Rounds weights to bfloat16, which halves the memory that a query has to fetch. Both shipped adapters lost less
+    // than .00002 of log loss by it; avx512_bf16 always does it.
     bool compact = false;
 };
 
@@ -102,21 +108,24 @@ public:
         }
     }
 
-    static Adapter from_memory(const void* bytes, std::size_t size, const Options& options = {}) { return Adapter(parse_weights(bytes, size), options); }
+    static Adapter from_memory(const void* bytes, std::size_t size, const Options& options = {}) {
+        return Adapter(parse_weights(bytes, size), options);
+    }
 
     // Numbers that `prepare` takes, in the order of `parameters`.
     int parameter_count() const { return recipe_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
-    // The parameters of the only material that it knows, fitted to that; empty where it knows a class. `prepare` does not read them.
+    // The parameters of the only material that it knows, which `prepare` does not read; empty where it knows a class.
     const std::vector<float>& material() const { return weights_.material; }
-    // The number of the first of them that is not finite or beyond its training range, where the network makes up plausible
-    // values, or, if it knows a single material, not of that; -1 if there is none. `parameter` says whose number it is.
+    // The number of the first of them that is not finite or beyond its training range, where the network makes up
+    // plausible values, or, if it knows a single material, not of that; -1 if there is none. `parameter` says whose
+    // number it is.
     int check(const float* parameters) const {
         for (int k = 0; k < parameter_count(); ++k)
             if (!knows(k, parameters[k])) return k;
         return -1;
     }
-    // Moves each into its training range, NaN to the lower end; where it knows a single material, there is nothing to move.
+    // Moves each into its training range, NaN to the lower end. Where it knows a single material, nothing moves.
     void clamp(float* parameters) const {
         if (!material().empty()) return;
         for (int k = 0; k < parameter_count(); ++k) parameters[k] = parameter(k).clamped(parameters[k]);
@@ -127,8 +136,8 @@ public:
     int output_count() const { return recipe_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
-    // Whether the view's azimuth matters; where it does not, of `wi` only wi.z does. A cosine c in place of `wi` stands for
-    // the azimuth 0: wi = (sqrt(1 - c^2), 0, c).
+    // Whether the view's azimuth matters; where it does not, of `wi` only wi.z does. A cosine c in place of `wi` stands
+    // for the azimuth 0: wi = (sqrt(1 - c^2), 0, c).
     bool anisotropic() const { return recipe_.encoding.anisotropic(); }
 
     // The blend for the parameters of the source material, seen from `wi`.
@@ -138,7 +147,9 @@ public:
         kernels().prepare(recipe_, parameters, wi, made.blend_);
         return made;
     }
-    Material prepare(const float* parameters, float cos_theta_i) const { return prepare(parameters, at_azimuth_0(cos_theta_i)); }
+    Material prepare(const float* parameters, float cos_theta_i) const {
+        return prepare(parameters, at_azimuth_0(cos_theta_i));
+    }
 
     // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
     void prepare_many(int count, const float* parameters, const Direction* wi, Material* materials) const {
@@ -155,7 +166,9 @@ public:
         }
     }
     void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
-        in_blocks(count, cos_theta_i, [&](int first, int now, const Direction* wi) { prepare_many(now, row(parameters, first), wi, materials + first); });
+        in_blocks(count, cos_theta_i, [&](int first, int now, const Direction* wi) {
+            prepare_many(now, row(parameters, first), wi, materials + first);
+        });
     }
 
     // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
@@ -164,7 +177,9 @@ public:
         kernels().encode(recipe_, parameters, wi, inputs);
         network_.forward(inputs, raw);
     }
-    void network_outputs(const float* parameters, float cos_theta_i, float* raw) const { network_outputs(parameters, at_azimuth_0(cos_theta_i), raw); }
+    void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
+        network_outputs(parameters, at_azimuth_0(cos_theta_i), raw);
+    }
 
     // Likewise for many, rows of `output_count` numbers.
     void network_outputs_many(int count, const float* parameters, const Direction* wi, float* raw) const {
@@ -173,12 +188,14 @@ public:
             const int now = std::min(BLOCK, count - first);
             outputs_of_block(now, row(parameters, first), wi + first, outputs);
             for (int q = 0; q < now; ++q)
-                std::copy_n(outputs + q * network_.output_stride(), output_count(), raw + static_cast<std::size_t>(first + q) * output_count());
+                std::copy_n(outputs + q * network_.output_stride(), output_count(),
+                            raw + static_cast<std::size_t>(first + q) * output_count());
         }
     }
     void network_outputs_many(int count, const float* parameters, const float* cos_theta_i, float* raw) const {
         in_blocks(count, cos_theta_i, [&](int first, int now, const Direction* wi) {
-            network_outputs_many(now, row(parameters, first), wi, raw + static_cast<std::size_t>(first) * output_count());
+            network_outputs_many(now, row(parameters, first), wi,
+                                 raw + static_cast<std::size_t>(first) * output_count());
         });
     }
 
@@ -187,7 +204,8 @@ private:
 
     Adapter(Weights weights, const Options& options) : weights_(std::move(weights)) {
         for (const TargetParam& p : weights_.target) add_fields(p);
-        for (std::size_t k = 0; k < weights_.parameters.size(); ++k) owners_.insert(owners_.end(), weights_.parameters[k].size, k);
+        for (std::size_t k = 0; k < weights_.parameters.size(); ++k)
+            owners_.insert(owners_.end(), weights_.parameters[k].size, k);
         recipe_.encoding = Encoding(weights_);
         recipe_.instances = weights_.instances;
         recipe_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
@@ -213,11 +231,19 @@ private:
     void add_fields(const TargetParam& p) {
         using P = Principled<float>;
         static constexpr std::pair<const char*, std::size_t> FIELDS[] = {
-            {"base_color", offsetof(P, base_color)}, {"roughness", offsetof(P, roughness)}, {"metallic", offsetof(P, metallic)},
-            {"specular", offsetof(P, specular)}, {"spec_tint", offsetof(P, spec_tint)}, {"sheen", offsetof(P, sheen)},
-            {"sheen_tint", offsetof(P, sheen_tint)}, {"clearcoat", offsetof(P, clearcoat)}, {"clearcoat_gloss", offsetof(P, clearcoat_gloss)},
-            {"anisotropic", offsetof(P, anisotropic)}, {"flatness", offsetof(P, flatness)},
-            {"fade", offsetof(P, fade)}, {"fade_width", offsetof(P, fade_width)}};
+            {"base_color", offsetof(P, base_color)},
+            {"roughness", offsetof(P, roughness)},
+            {"metallic", offsetof(P, metallic)},
+            {"specular", offsetof(P, specular)},
+            {"spec_tint", offsetof(P, spec_tint)},
+            {"sheen", offsetof(P, sheen)},
+            {"sheen_tint", offsetof(P, sheen_tint)},
+            {"clearcoat", offsetof(P, clearcoat)},
+            {"clearcoat_gloss", offsetof(P, clearcoat_gloss)},
+            {"anisotropic", offsetof(P, anisotropic)},
+            {"flatness", offsetof(P, flatness)},
+            {"fade", offsetof(P, fade)},
+            {"fade_width", offsetof(P, fade_width)}};
         in_plane_ |= p.in_plane;
         for (const auto& [name, offset] : FIELDS)
             if (p.name == name && p.size == (p.name == "base_color" ? 3 : 1)) {
@@ -230,9 +256,12 @@ private:
     // Refuses a network that does not fit its own description, or this version's target.
     void check() const {
         if (anisotropic() && (in_plane_ || !weights_.directional))
-            throw Error("an anisotropic adapter whose target holds in the plane of incidence, or ignores the direction; train again");
-        if (weights_.dialect != DIALECT) throw Error("written for the Principled dialect '" + weights_.dialect + "', not '" + DIALECT + "'");
-        if (weights_.instances > MAX_INSTANCES) throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
+            throw Error(
+                "anisotropic, but its target holds in the plane of incidence, or ignores the direction; train again");
+        if (weights_.dialect != DIALECT)
+            throw Error("written for the Principled dialect '" + weights_.dialect + "', not '" + DIALECT + "'");
+        if (weights_.instances > MAX_INSTANCES)
+            throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
         if (weights_.layers.front().in != recipe_.encoding.size() || weights_.layers.back().out != output_count())
             throw Error("the network does not fit its description; train again");
     }
@@ -241,7 +270,8 @@ private:
     void lay_out_ranges() {
         const int count = network_.output_stride();
         ranges_ = detail::aligned<float>(5 * static_cast<std::size_t>(count));
-        float *start = ranges_.get(), *slope = start + count, *factor = slope + count, *rate = factor + count, *in_plane = rate + count;
+        float *start = ranges_.get(), *slope = start + count, *factor = slope + count;
+        float *rate = factor + count, *in_plane = rate + count;
         recipe_.ranges = {count, 0, start, slope, factor, rate, in_plane};
         int next = 0;
         for (int k = 0; k < weights_.instances; ++k)
@@ -249,7 +279,8 @@ private:
                 for (int c = 0; c < p.size; ++c, ++next) {
                     in_plane[next] = p.in_plane;
                     (p.logarithmic ? factor : start)[next] = static_cast<float>(p.low);
-                    (p.logarithmic ? rate : slope)[next] = static_cast<float>(p.logarithmic ? std::log2(p.high / p.low) : p.high - p.low);
+                    (p.logarithmic ? rate : slope)[next] =
+                        static_cast<float>(p.logarithmic ? std::log2(p.high / p.low) : p.high - p.low);
                     if (p.logarithmic) recipe_.ranges.logarithmic = next + 1;
                 }
         std::fill(slope + next, slope + output_count(), 1.0f);
@@ -264,7 +295,9 @@ private:
     }
 
     // Isotropic adapters do not look at what would cost them a root.
-    Direction at_azimuth_0(float cos_theta_i) const { return {anisotropic() ? safe_sqrt(1.0f - cos_theta_i * cos_theta_i) : 0.0f, 0.0f, cos_theta_i}; }
+    Direction at_azimuth_0(float cos_theta_i) const {
+        return {anisotropic() ? safe_sqrt(1.0f - cos_theta_i * cos_theta_i) : 0.0f, 0.0f, cos_theta_i};
+    }
 
     // Calls `work(first, count, wi)` for blocks of queries, whose first is the number `first` of all.
     template <class Work>
@@ -272,17 +305,21 @@ private:
         Direction wi[BLOCK];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
-            std::transform(cos_theta_i + first, cos_theta_i + first + now, wi, [&](float cosine) { return at_azimuth_0(cosine); });
+            std::transform(cos_theta_i + first, cos_theta_i + first + now, wi,
+                           [&](float cosine) { return at_azimuth_0(cosine); });
             work(first, now, wi);
         }
     }
 
     // The parameters of query `q`.
-    const float* row(const float* parameters, int q) const { return parameters + static_cast<std::size_t>(q) * parameter_count(); }
+    const float* row(const float* parameters, int q) const {
+        return parameters + static_cast<std::size_t>(q) * parameter_count();
+    }
 
     void outputs_of_block(int count, const float* parameters, const Direction* wi, float* outputs) const {
         alignas(64) float inputs[BLOCK * WIDEST_LAYER];
-        for (int q = 0; q < count; ++q) kernels().encode(recipe_, row(parameters, q), wi[q], inputs + q * network_.input_stride());
+        for (int q = 0; q < count; ++q)
+            kernels().encode(recipe_, row(parameters, q), wi[q], inputs + q * network_.input_stride());
         network_.forward_many(count, inputs, outputs);
     }
 
@@ -295,8 +332,8 @@ private:
     bool in_plane_ = false;
 };
 
-// The blends of an untextured material over cos(theta_i), interpolated between nodes: no network at the shading point. Of
-// isotropic adapters only.
+// The blends of an untextured material over cos(theta_i), interpolated between nodes: no network at the shading point.
+// Of isotropic adapters only.
 class Curves {
 public:
     // As many as nma/render/curves.py has.
@@ -304,7 +341,9 @@ public:
 
     // Throws `Error` for anisotropic adapters.
     Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
-        if (adapter.anisotropic()) throw Error("an anisotropic adapter, whose materials depend on the view's azimuth: there are no curves over cos(theta_i); prepare by direction");
+        if (adapter.anisotropic())
+            throw Error(
+                "an anisotropic adapter has no curves, as the azimuth of the view matters; prepare by direction");
         for (int n = 0; n < std::max(nodes, 2); ++n) {
             const float cosine = static_cast<float>(n) / static_cast<float>(std::max(nodes, 2) - 1);
             nodes_.push_back(adapter.prepare(parameters, maximum(cosine, 1e-4f)));
@@ -316,15 +355,18 @@ public:
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
         const Lanes<float> t = position - static_cast<float>(left);
-        const Blend<float> &a = nodes_[left].blend_, &b = nodes_[left + 1].blend_;
+        const Blend<float>& a = nodes_[left].blend_;
+        const Blend<float>& b = nodes_[left + 1].blend_;
         Material made;
         made.in_plane_ = nodes_[left].in_plane_;
         made.blend_.count = a.count;
         made.blend_.scale = a.scale + (b.scale - a.scale) * t[0];
         for (int n = 0; n < a.used(); ++n) {
-            const Lanes<float> *from = a.packs[n].lanes(), *to = b.packs[n].lanes();
+            const Lanes<float>* from = a.packs[n].lanes();
+            const Lanes<float>* to = b.packs[n].lanes();
             Lanes<float>* between = made.blend_.packs[n].lanes();
-            for (std::size_t k = 0; k < sizeof(Pack<float>) / sizeof(Lanes<float>); ++k) between[k] = lerp(from[k], to[k], t);
+            for (std::size_t k = 0; k < sizeof(Pack<float>) / sizeof(Lanes<float>); ++k)
+                between[k] = lerp(from[k], to[k], t);
         }
         return made;
     }

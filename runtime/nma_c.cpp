@@ -17,7 +17,9 @@ static_assert(std::is_trivially_copyable_v<nma::Material>);
 
 namespace {
 
-const nma::Material& of(const nma_material& material) { return *std::launder(reinterpret_cast<const nma::Material*>(&material)); }
+const nma::Material& of(const nma_material& material) {
+    return *std::launder(reinterpret_cast<const nma::Material*>(&material));
+}
 void put(nma_material* to, const nma::Material& material) { new (to) nma::Material(material); }
 nma::InstructionSet set_of(int number) { return static_cast<nma::InstructionSet>(number - NMA_PORTABLE); }
 nma::Direction direction(const float* v) { return {v[0], v[1], v[2]}; }
@@ -32,7 +34,8 @@ void in_blocks(int count, F work) {
 
 // At most BLOCK materials, for cosines or directions.
 template <class View>
-void prepare_block(const nma::Adapter& adapter, int count, const float* parameters, const View* views, nma_material* materials) {
+void prepare_block(const nma::Adapter& adapter, int count, const float* parameters, const View* views,
+                   nma_material* materials) {
     nma::Material block[BLOCK];
     adapter.prepare_many(count, parameters, views, block);
     for (int k = 0; k < count; ++k) put(materials + k, block[k]);
@@ -71,14 +74,17 @@ nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
 
 }  // namespace
 
-int nma_supported(int set) { return set == NMA_FASTEST || (set >= NMA_PORTABLE && set <= NMA_AVX512_BF16 && nma::supported(set_of(set))); }
+int nma_supported(int set) {
+    return set == NMA_FASTEST || (set >= NMA_PORTABLE && set <= NMA_AVX512_BF16 && nma::supported(set_of(set)));
+}
 
 nma_adapter* nma_load(const char* path, int set, char* message, size_t size) {
     return loaded([&](const nma::Options& options) { return nma::Adapter::load(path, options); }, set, message, size);
 }
 
 nma_adapter* nma_from_memory(const void* bytes, size_t length, int set, char* message, size_t size) {
-    return loaded([&](const nma::Options& options) { return nma::Adapter::from_memory(bytes, length, options); }, set, message, size);
+    return loaded([&](const nma::Options& options) { return nma::Adapter::from_memory(bytes, length, options); }, set,
+                  message, size);
 }
 
 void nma_free(nma_adapter* adapter) { delete adapter; }
@@ -104,9 +110,11 @@ void nma_prepare(const nma_adapter* a, const float* parameters, float cos_theta_
     put(material, a->adapter.prepare(parameters, cos_theta_i));
 }
 
-void nma_prepare_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i, nma_material* materials) {
+void nma_prepare_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i,
+                      nma_material* materials) {
     in_blocks(count, [&](size_t first, int now) {
-        prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), cos_theta_i + first, materials + first);
+        prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), cos_theta_i + first,
+                      materials + first);
     });
 }
 
@@ -114,21 +122,25 @@ void nma_prepare_direction(const nma_adapter* a, const float* parameters, const 
     put(material, a->adapter.prepare(parameters, direction(wi)));
 }
 
-void nma_prepare_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi, nma_material* materials) {
+void nma_prepare_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi,
+                                nma_material* materials) {
     in_blocks(count, [&](size_t first, int now) {
         const Directions rows(now, wi + 3 * first);
         prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), rows.wi, materials + first);
     });
 }
 
-void nma_outputs_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i, float* outputs) {
+void nma_outputs_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i,
+                      float* outputs) {
     a->adapter.network_outputs_many(count, parameters, cos_theta_i, outputs);
 }
 
-void nma_outputs_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi, float* outputs) {
+void nma_outputs_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi,
+                                float* outputs) {
     in_blocks(count, [&](size_t first, int now) {
         const Directions rows(now, wi + 3 * first);
-        a->adapter.network_outputs_many(now, parameters + first * a->adapter.parameter_count(), rows.wi, outputs + first * a->adapter.output_count());
+        a->adapter.network_outputs_many(now, parameters + first * a->adapter.parameter_count(), rows.wi,
+                                        outputs + first * a->adapter.output_count());
     });
 }
 
@@ -139,7 +151,9 @@ nma_curves* nma_curves_new(const nma_adapter* a, const float* parameters) {
         return nullptr;
     }
 }
-void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material) { put(material, curves->curves.at(cos_theta_i)); }
+void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material) {
+    put(material, curves->curves.at(cos_theta_i));
+}
 void nma_curves_free(nma_curves* curves) { delete curves; }
 
 void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* out) {

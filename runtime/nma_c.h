@@ -1,8 +1,8 @@
 /* Neural Material Adapter for C, and for whatever calls C: see nma.h for what the functions do.
  *
  * Compile nma_c.cpp beside your code, or link the library nma_c. Pointers are to arrays of floats; directions are unit
- * vectors in the local frame, z up. An adapter may be shared by threads. Only loading and `nma_curves_new` can fail: they
- * return NULL, and loading says why in `message`. */
+ * vectors in the local frame, z up. An adapter may be shared by threads. Only loading and `nma_curves_new` can fail:
+ * they return NULL, and loading says why in `message`. */
 #ifndef NMA_C_H
 #define NMA_C_H
 
@@ -34,13 +34,14 @@ typedef struct {
     NMA_ALIGNED float opaque[168];
 } nma_material;
 
-/* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to one
- * to have weights rounded to bfloat16: nma::Options. */
+/* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to
+ * one to have weights rounded to bfloat16: nma::Options. */
 enum { NMA_FASTEST, NMA_PORTABLE, NMA_NEON, NMA_AVX2, NMA_AVX512, NMA_AVX512_BF16, NMA_COMPACT = 0x100 };
 NMA_C_API int nma_supported(int instruction_set);
 
 NMA_C_API nma_adapter* nma_load(const char* path, int instruction_set, char* message, size_t message_size);
-NMA_C_API nma_adapter* nma_from_memory(const void* bytes, size_t size, int instruction_set, char* message, size_t message_size);
+NMA_C_API nma_adapter* nma_from_memory(const void* bytes, size_t size, int instruction_set, char* message,
+                                       size_t message_size);
 NMA_C_API void nma_free(nma_adapter* adapter);
 
 NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
@@ -59,16 +60,22 @@ NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
 /* Whether the view's azimuth matters. Cosines alone stand for the azimuth 0 then: give directions. */
 NMA_C_API int nma_anisotropic(const nma_adapter* adapter);
 
-NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i, nma_material* material);
-NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, nma_material* materials);
+NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i,
+                           nma_material* material);
+NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters,
+                                const float* cos_theta_i, nma_material* materials);
 
 /* The same seen from directions, three floats each; of isotropic adapters only their z matters. */
-NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi, nma_material* material);
-NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters, const float* wi, nma_material* materials);
+NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi,
+                                     nma_material* material);
+NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters,
+                                          const float* wi, nma_material* materials);
 
 /* Raw outputs of the network, `nma_output_count` for each query. */
-NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters, const float* cos_theta_i, float* outputs);
-NMA_C_API void nma_outputs_direction_many(const nma_adapter* adapter, int count, const float* parameters, const float* wi, float* outputs);
+NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters,
+                                const float* cos_theta_i, float* outputs);
+NMA_C_API void nma_outputs_direction_many(const nma_adapter* adapter, int count, const float* parameters,
+                                          const float* wi, float* outputs);
 
 /* Curves of an untextured material. NULL for an anisotropic adapter, which has none, and where memory is short. */
 NMA_C_API nma_curves* nma_curves_new(const nma_adapter* adapter, const float* parameters);
@@ -78,7 +85,8 @@ NMA_C_API void nma_curves_free(nma_curves* curves);
 /* For each material: `value_pdf` gets f cos(theta_o) [1/sr] as RGB and the density [1/sr]; `wo_value_pdf` a direction
  * before them, drawn with three uniform numbers in [0, 1) from `u`. A density of 0 marks an invalid direction. */
 NMA_C_API void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* value_pdf);
-NMA_C_API void nma_sample(int count, const nma_material* materials, const float* wi, const float* u, float* wo_value_pdf);
+NMA_C_API void nma_sample(int count, const nma_material* materials, const float* wi, const float* u,
+                          float* wo_value_pdf);
 
 /* For each material the directional albedo at `wi` as RGB, at most 1, without noise. */
 NMA_C_API void nma_albedo(int count, const nma_material* materials, const float* wi, float* albedo);

@@ -30,7 +30,8 @@ void layered_sample(int n, const float* parameters, const float* wi, const float
         const auto drawn = nma::layered::sample(layers, density, vec(wi), u[0], u[1], u[2]);
         put(drawn.wo, out);
         out[3] = drawn.pdf;
-        put(drawn.pdf > 0.0f ? nma::layered::evaluate(layers, vec(wi), drawn.wo, random) : Vec{0.0f, 0.0f, 0.0f}, out + 4);
+        put(drawn.pdf > 0.0f ? nma::layered::evaluate(layers, vec(wi), drawn.wo, random) : Vec{0.0f, 0.0f, 0.0f},
+            out + 4);
     }
 }
 

@@ -36,7 +36,8 @@ void evaluate_float(int n, int count, bool bounded, const float* blends, const f
     evaluate(n, count, bounded, blends, wi, wo, out);
 }
 
-void evaluate_double(int n, int count, bool bounded, const double* blends, const double* wi, const double* wo, double* out) {
+void evaluate_double(int n, int count, bool bounded, const double* blends, const double* wi, const double* wo,
+                     double* out) {
     evaluate(n, count, bounded, blends, wi, wo, out);
 }
 

@@ -23,10 +23,10 @@ def classes() -> str:
     """The header `classes.h`."""
     parts = [_HEAD]
     for name, space in _simulated():
-        rows = ",\n        ".join(_row(param) for param in space.params)
-        parts.append(
-            f"inline std::vector<SourceParam> {name}_parameters() {{\n    return {{\n        {rows}}};\n}}\n"
-        )
+        parts.append(f"inline std::vector<SourceParam> {name}_parameters() {{")
+        parts.append(f"    std::vector<SourceParam> made({len(space.params)});")
+        parts += [f"    made[{k}] = {_row(param)};" for k, param in enumerate(space.params)]
+        parts.append("    return made;\n}\n")
     parts.append("}  // namespace nma")
     return "\n".join(parts) + "\n"
 

@@ -29,7 +29,8 @@ _OPERATORS: dict[type, str] = {
     ast.LtE: "<=",
 }
 _TIGHTNESS = {"*": 3, "/": 3, "+": 2, "-": 2, ">": 1, ">=": 1, "<": 1, "<=": 1, "&&": 0}
-_WIDTH = 110
+# As in .clang-format.
+_WIDTH = 120
 
 
 def cpp() -> str:
@@ -51,19 +52,24 @@ def _structure(name: str, doc: str, fields: list[tuple[str, str]]) -> str:
 def print_function(function: Function) -> str:
     arguments = ", ".join(f"{_argument(kind)} {name}" for name, kind in function.arguments)
     head = f"inline {_type(function.returns)} {function.name}({arguments}) {{"
-    body = [_wrapped(_statement(function, statement)) for statement in function.body]
+    body = [_line(function, node) for node in function.body]
     return "\n".join([_comment(function.doc), "template <class T>", head, *body, "}", ""])
 
 
-def _wrapped(statement: str) -> str:
-    return textwrap.fill(
-        statement, _WIDTH, initial_indent=4 * " ", subsequent_indent=8 * " ", break_long_words=False
-    )
+def _line(function: Function, node: ast.stmt) -> str:
+    """The statement on one line, or on two that meet at its `=`, which is how clang-format would break it."""
+    statement = _statement(function, node)
+    name, assigns, value = statement.partition(" = ")
+    if 4 + len(statement) <= _WIDTH:
+        return f"    {statement}"
+    if assigns and 8 + len(value) <= _WIDTH:
+        return f"    {name} =\n        {value}"
+    raise function.unsupported(node, f"a statement too long for {_WIDTH} columns of C++", "name a part of it")
 
 
 def _comment(doc: str) -> str:
     first = doc.split("\n\n")[0].replace("\n", " ")
-    return "\n".join(f"// {line}" for line in textwrap.wrap(first, _WIDTH))
+    return "\n".join(f"// {line}" for line in textwrap.wrap(first, _WIDTH - 3))
 
 
 def _type(kind: str) -> str:

@@ -74,9 +74,11 @@ class Function:
     body: list[ast.stmt]
     module: ModuleType
 
-    def unsupported(self, node: ast.AST, what: str) -> Unsupported:
+    def unsupported(
+        self, node: ast.AST, what: str, remedy: str = "write it with arithmetic and `ops`"
+    ) -> Unsupported:
         place = f"{self.module.__file__}:{getattr(node, 'lineno', '?')}"
-        return Unsupported(f"{place}: {what} cannot be exported; write it with arithmetic and `ops`")
+        return Unsupported(f"{place}: {what} cannot be exported; {remedy}")
 
 
 @cache

@@ -43,11 +43,9 @@ class Albedos(NamedTuple):
 def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
     """Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0, and nothing fades."""
     weight = schlick_weight(cos_theta_i)
-    return Albedos(
-        diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO,
-        spec_albedo(p, cos_theta_i) + MIN_ALBEDO,
-        clearcoat_albedo(p, cos_theta_i, weight),
-    )
+    diffuse = diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO
+    spec = spec_albedo(p, cos_theta_i) + MIN_ALBEDO
+    return Albedos(diffuse, spec, clearcoat_albedo(p, cos_theta_i, weight))
 
 
 def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:
@@ -88,5 +86,5 @@ def clearcoat_albedo(p: Principled, cos: Float, weight: Float) -> Float:
     cos2 = cos * cos
     alpha2 = CLEARCOAT_MASKING_ALPHA * CLEARCOAT_MASKING_ALPHA
     masking = 2.0 * cos / (cos + ops.sqrt(cos2 + alpha2 * (1.0 - cos2)))
-    fresnel = CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * weight
+    fresnel = ops.lerp(CLEARCOAT_F0, 1.0, weight)
     return p.clearcoat * (fresnel * cos2 * masking * masking + CLEARCOAT_MARGIN)

@@ -108,7 +108,7 @@ def geometry(wi: Vec3, wo: Vec3) -> Geometry:
     length = ops.sqrt(ops.dot(h, h))
     cos_d = 0.5 * length
     weight_d = schlick_weight(cos_d)
-    fresnel = CLEARCOAT_F0 + (1.0 - CLEARCOAT_F0) * weight_d
+    fresnel = ops.lerp(CLEARCOAT_F0, 1.0, weight_d)
     masking_i = 2.0 * i.z / masking_denominator(i, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
     masking_o = 2.0 * o.z / masking_denominator(o, CLEARCOAT_MASKING_ALPHA, CLEARCOAT_MASKING_ALPHA)
     clearcoat = 0.25 * fresnel * masking_i * masking_o * o.z

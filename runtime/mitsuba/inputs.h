@@ -24,8 +24,8 @@ struct Input {
 
     SourceParam param;
     ref<Texture> texture;
-    // Numbers as they were checked last and moved into the range, and as `mi.traverse` shows them. Of what is lent, `value` is
-    // what it was when it was checked: of edits by those who share it nobody tells.
+    // Numbers as they were checked last and moved into the range, and as `mi.traverse` shows them. Of what is lent,
+    // `value` is what it was when it was checked: of edits by those who share it nobody tells.
     Colour value, shown;
     // Of a texture, the channel that a parameter of one number takes; -1 if none was chosen.
     int channel = -1;
@@ -51,12 +51,15 @@ public:
     using Input = nma_plugin::Input<Float, Spectrum>;
     using Colour = typename Input::Colour;
 
-    // Ranges are those of the parameters: what the material means, or with `trained` what the adapter was trained on. There the
-    // property `clamp` moves what lies beyond instead of refusing it. What a texture only knows while rendering (mesh
-    // attributes) is moved always.
-    Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained) : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
+    // Ranges are those of the parameters: what the material means, or with `trained` what the adapter was trained on.
+    // There the property `clamp` moves what lies beyond instead of refusing it. What a texture only knows while
+    // rendering (mesh attributes) is moved always.
+    Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained)
+        : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
         if (props.has_property("material"))
-            Throw("`material` is known in vectorised variants only; give the parameters (`nma materials NAME` shows them, nma.render.load.material_bsdf makes them)");
+            Throw(
+                "`material` is known in vectorised variants only; give the parameters (`nma materials NAME` shows "
+                "them, nma.render.load.material_bsdf makes them)");
         for (const SourceParam& p : parameters) {
             if (!props.has_property(p.name)) Throw("no value for %s; give it a number, a colour or a texture", p.name);
             inputs_.push_back(read(props, p));
@@ -87,13 +90,16 @@ public:
 
     // Whether inputs that are the same everywhere are what they were when they were checked.
     bool settled(const SurfaceInteraction3f& si) const {
-        return !lent_ || std::all_of(inputs_.begin(), inputs_.end(), [&](const Input& input) { return !input.lent() || dr::all(at(input, si) == input.value); });
+        return !lent_ || std::all_of(inputs_.begin(), inputs_.end(), [&](const Input& input) {
+            return !input.lent() || dr::all(at(input, si) == input.value);
+        });
     }
 
     void traverse(TraversalCallback* callback) {
         for (Input& input : inputs_) {
             if (input.texture) callback->put(input.param.name, input.texture, ParamFlags::NonDifferentiable);
-            else if (input.param.size == 1) callback->put(input.param.name, input.shown.x(), ParamFlags::NonDifferentiable);
+            else if (input.param.size == 1)
+                callback->put(input.param.name, input.shown.x(), ParamFlags::NonDifferentiable);
             else callback->put(input.param.name, input.shown, ParamFlags::NonDifferentiable);
         }
     }
@@ -110,7 +116,8 @@ public:
     }
 
     const Input* find(std::string_view name) const {
-        const auto found = std::find_if(inputs_.begin(), inputs_.end(), [&](const Input& input) { return input.param.name == name; });
+        const auto found =
+            std::find_if(inputs_.begin(), inputs_.end(), [&](const Input& input) { return input.param.name == name; });
         return found == inputs_.end() ? nullptr : &*found;
     }
 
@@ -119,7 +126,8 @@ public:
         if (!input.texture) return input.value;
         const Colour colour = input.looked_up(si);
         for (int c = 0; input.known && c < input.param.size; ++c)
-            if (!allowed(input.param, colour[c])) Throw("the texture of %s holds %g, %s", input.param.name, colour[c], range(input.param));
+            if (!allowed(input.param, colour[c]))
+                Throw("the texture of %s holds %g, %s", input.param.name, colour[c], range(input.param));
         return within(input.param, colour);
     }
 
@@ -136,7 +144,8 @@ public:
 
 private:
     static Colour within(const SourceParam& p, const Colour& colour) {
-        return {p.clamped(static_cast<float>(colour.x())), p.clamped(static_cast<float>(colour.y())), p.clamped(static_cast<float>(colour.z()))};
+        return {p.clamped(static_cast<float>(colour.x())), p.clamped(static_cast<float>(colour.y())),
+                p.clamped(static_cast<float>(colour.z()))};
     }
 
     static Input read(const Properties& props, const SourceParam& p) {
@@ -159,7 +168,8 @@ private:
             input.texture = nullptr;
         }
         const Colour& c = input.shown;
-        if (p.size == 1 && (c.x() != c.y() || c.x() != c.z())) Throw("%s wants one number or a texture, got the colour %g, %g, %g", p.name, c.x(), c.y(), c.z());
+        if (p.size == 1 && (c.x() != c.y() || c.x() != c.z()))
+            Throw("%s wants one number or a texture, got the colour %g, %g, %g", p.name, c.x(), c.y(), c.z());
         return input;
     }
 
@@ -168,7 +178,8 @@ private:
         const std::string name = input.param.name + "_channel";
         if (!props.has_property(name)) return -1;
         const std::string wanted(props.get<std::string_view>(name));
-        if (!input.texture || input.param.size > 1) Throw("%s chooses a channel of a texture for a parameter of one number; leave it out", name);
+        if (!input.texture || input.param.size > 1)
+            Throw("%s chooses a channel of a texture for a parameter of one number; leave it out", name);
         const auto place = std::string_view("rgb").find(wanted);
         if (wanted.size() != 1 || place == std::string_view::npos) Throw("%s is '%s'; take r, g or b", name, wanted);
         return static_cast<int>(place);
@@ -196,7 +207,10 @@ private:
         const bool coloured = texels.channels >= 3, one = coloured && input.channel >= 0;
         for (std::size_t k = 0; p.size == 1 && coloured && !one && k < numbers.size(); ++k)
             if (nma::absolute(numbers[k] - numbers[k - k % texels.channels]) > 1e-6f)
-                Throw("the texture of %s is coloured, and %s is one number per pixel; choose a channel: set `%s_channel` to r, g or b", p.name, p.name, p.name);
+                Throw(
+                    "the texture of %s is coloured, and %s is one number per pixel; choose a channel: set `%s_channel` "
+                    "to r, g or b",
+                    p.name, p.name, p.name);
         std::size_t first = numbers.size(), bad = 0;
         const std::size_t start = one ? static_cast<std::size_t>(input.channel) : 0, step = one ? texels.channels : 1;
         for (std::size_t k = start; k < numbers.size(); k += step)
@@ -205,9 +219,14 @@ private:
             }
         if (!bad) return;
         const std::size_t pixel = first / texels.channels;
-        const std::string place = texels.pixels() > 1 ? tfm::format(" at x=%zu, y=%zu", pixel % texels.width, pixel / texels.width) : "";
-        const char* hint = texels.bytes ? "; its pixels are bytes, 0 to 1; with `format` \"variant\" a bitmap keeps floats, which can be edited" : "";
-        Throw("the texture of %s holds %g%s, one of %zu such values of %zu; %s%s", p.name, numbers[first], place, bad, numbers.size() / step, range(p), hint);
+        const std::string place =
+            texels.pixels() > 1 ? tfm::format(" at x=%zu, y=%zu", pixel % texels.width, pixel / texels.width) : "";
+        const char* hint =
+            texels.bytes
+                ? "; its pixels are bytes, 0 to 1; with `format` \"variant\" a bitmap keeps floats, which can be edited"
+                : "";
+        Throw("the texture of %s holds %g%s, one of %zu such values of %zu; %s%s", p.name, numbers[first], place, bad,
+              numbers.size() / step, range(p), hint);
     }
 
     bool allowed(const SourceParam& p, Float x) const {

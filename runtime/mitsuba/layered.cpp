@@ -1,9 +1,10 @@
-// Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, the reference for its adapter. Built
-// by `nma mitsuba build`.
+// Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, the reference for its adapter.
+// Built by `nma mitsuba build`.
 //
 // `eval` is one unbiased estimate. Mitsuba gives it no random numbers; it makes its own from the bits of its arguments.
-// `sample` is one walk where the shape has this very BSDF. Within others, such as `blendbsdf` and `mask`, which recombine
-// samples by their densities, it draws from the density itself, as no walk does, and its weight is an estimate over that.
+// `sample` is one walk where the shape has this very BSDF. Within others, such as `blendbsdf` and `mask`, which
+// recombine samples by their densities, it draws from the density itself, as no walk does, and its weight is an
+// estimate over that.
 // Properties: the parameters of the class `layered3`.
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/shape.h>
@@ -27,18 +28,22 @@ public:
         return hidden(context, si) ? 0.0f : View(inputs_, si).pdf(wo);
     }
 
-    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
+    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
+                                        Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f};
         return evaluated(View(inputs_, si), si, wo);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u, const Point2f& u2, Mask) const override {
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u,
+                                             const Point2f& u2, Mask) const override {
         if (hidden(context, si)) return {dr::zeros<BSDFSample3f>(), 0.0f};
         return sampled(View(inputs_, si), si, u, u2);
     }
 
-    std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Float u,
-                                                                        const Point2f& u2, Mask) const override {
+    std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context,
+                                                                        const SurfaceInteraction3f& si,
+                                                                        const Vector3f& wo, Float u, const Point2f& u2,
+                                                                        Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
         const View view(inputs_, si);
         const auto [value, pdf] = evaluated(view, si, wo);
@@ -57,7 +62,8 @@ private:
         nma::layered::Vec wi;
         nma::layered::Density density;
 
-        View(const Inputs& inputs, const SurfaceInteraction3f& si) : layers(at(inputs, si)), wi(direction(si.wi)), density(layers, wi) {}
+        View(const Inputs& inputs, const SurfaceInteraction3f& si)
+            : layers(at(inputs, si)), wi(direction(si.wi)), density(layers, wi) {}
 
         float pdf(const Vector3f& wo) const { return nma::layered::pdf(layers, density, wi, direction(wo)); }
     };
@@ -68,7 +74,9 @@ private:
         return nma::layered::Layers::of(numbers);
     }
 
-    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return nma::layered::albedo(at(inputs_, si), direction(si.wi)); }
+    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override {
+        return nma::layered::albedo(at(inputs_, si), direction(si.wi));
+    }
 
     // A stream of random numbers that depends on the bits of `numbers`.
     template <std::size_t N>
@@ -83,12 +91,14 @@ private:
 
     static std::pair<Spectrum, Float> evaluated(const View& view, const SurfaceInteraction3f& si, const Vector3f& wo) {
         if (!(wo.z() > 0.0f)) return {0.0f, 0.0f};
-        nma::layered::Random rng = random({wo.x(), wo.y(), wo.z(), si.wi.x(), si.wi.y(), si.wi.z(), si.p.x(), si.p.y(), si.p.z(), si.uv.x(), si.uv.y()});
+        nma::layered::Random rng = random({wo.x(), wo.y(), wo.z(), si.wi.x(), si.wi.y(), si.wi.z(), si.p.x(), si.p.y(),
+                                           si.p.z(), si.uv.x(), si.uv.y()});
         const nma::Vec3<float> value = nma::layered::evaluate(view.layers, view.wi, direction(wo), rng);
         return {Spectrum(value.x, value.y, value.z), view.pdf(wo)};
     }
 
-    std::pair<BSDFSample3f, Spectrum> sampled(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
+    std::pair<BSDFSample3f, Spectrum> sampled(const View& view, const SurfaceInteraction3f& si, Float u,
+                                              const Point2f& u2) const {
         BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
         drawn.eta = 1.0f;
         drawn.sampled_type = +BSDFFlags::GlossyReflection;
@@ -99,7 +109,8 @@ private:
     }
 
     // Where a walk leaves, and its throughput. The density is near its own.
-    static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
+    static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
+                           BSDFSample3f& drawn) {
         nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
         const nma::layered::Walk walk = nma::layered::walk(view.layers, view.wi, rng);
         const nma::Vec3<float>& t = walk.throughput;
@@ -109,7 +120,8 @@ private:
     }
 
     // A direction that follows the density, and the estimate of `eval` over it.
-    static Spectrum followed(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2, BSDFSample3f& drawn) {
+    static Spectrum followed(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
+                             BSDFSample3f& drawn) {
         const nma::Vec3<float> wo = nma::layered::sample(view.layers, view.density, view.wi, u, u2.x(), u2.y()).wo;
         drawn.wo = Vector3f(wo.x, wo.y, wo.z);
         const auto [value, pdf] = evaluated(view, si, drawn.wo);

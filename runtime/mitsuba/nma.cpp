@@ -1,10 +1,11 @@
-// Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material as its adapter sees it. Built by `nma mitsuba build`.
+// Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material as its adapter sees it. Built by
+// `nma mitsuba build`.
 //
-// Properties, as of the Python BSDF of the same name: `adapter`, a shipped adapter's name or a weights file; `clamp`; and
-// the parameters of the adapter's class. Beside them, `online`: whether the network also runs at every shading point of a
-// material without textures, which otherwise, unless it is anisotropic, becomes curves over cos(theta_i) when it is loaded;
-// and `precision`: "float32", "compact" (weights of eight bits, faster), or "bfloat16" (activations too, where the CPU has
-// products of such).
+// Properties, as of the Python BSDF of the same name: `adapter`, a shipped adapter's name or a weights file; `clamp`;
+// and the parameters of the adapter's class. Beside them, `online`: whether the network also runs at every shading
+// point of a material without textures, which otherwise, unless it is anisotropic, becomes curves over cos(theta_i)
+// when it is loaded; and `precision`: "float32", "compact" (weights of eight bits, faster), or "bfloat16" (activations
+// too, where the CPU has products of such).
 #include <mitsuba/core/fresolver.h>
 
 #include "nma.h"
@@ -19,7 +20,8 @@ public:
     MI_IMPORT_TYPES()
     using typename Base::Inputs;
 
-    explicit NmaBSDF(const Properties& props) : NmaBSDF(props, load(adapter_name(props), props.get<std::string_view>("precision", "float32"))) {}
+    explicit NmaBSDF(const Properties& props)
+        : NmaBSDF(props, load(adapter_name(props), props.get<std::string_view>("precision", "float32"))) {}
 
     void parameters_changed(const std::vector<std::string>& keys) override {
         curves_.reset();
@@ -27,22 +29,27 @@ public:
         tabulate();
     }
 
-    Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
+    Float pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
+              Mask active) const override {
         return eval_pdf(context, si, wo, active).second;
     }
 
-    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask) const override {
+    std::pair<Spectrum, Float> eval_pdf(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
+                                        Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f};
         return evaluated(context, prepare(si), si, wo);
     }
 
-    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u, const Point2f& u2, Mask) const override {
+    std::pair<BSDFSample3f, Spectrum> sample(const BSDFContext& context, const SurfaceInteraction3f& si, Float u,
+                                             const Point2f& u2, Mask) const override {
         if (hidden(context, si)) return {dr::zeros<BSDFSample3f>(), 0.0f};
         return sampled(context, prepare(si), si, u, u2);
     }
 
-    std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Float u,
-                                                                        const Point2f& u2, Mask) const override {
+    std::tuple<Spectrum, Float, BSDFSample3f, Spectrum> eval_pdf_sample(const BSDFContext& context,
+                                                                        const SurfaceInteraction3f& si,
+                                                                        const Vector3f& wo, Float u, const Point2f& u2,
+                                                                        Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
         const nma::Material material = prepare(si);
         const auto [value, density] = evaluated(context, material, si, wo);
@@ -58,15 +65,20 @@ private:
     static constexpr int MOST_PARAMETERS = 64;
 
     NmaBSDF(const Properties& props, nma::Adapter adapter)
-        : Base(props, wanted(props, adapter), true), name_(adapter_name(props)), adapter_(std::move(adapter)), online_(props.get<bool>("online", false)) {
+        : Base(props, wanted(props, adapter), true),
+          name_(adapter_name(props)),
+          adapter_(std::move(adapter)),
+          online_(props.get<bool>("online", false)) {
         if (adapter_.anisotropic()) m_flags = m_components[0] = m_flags | BSDFFlags::Anisotropic;
         tabulate();
     }
 
-    static std::string adapter_name(const Properties& props) { return std::string(props.get<std::string_view>("adapter", "layered3-5x64")); }
+    static std::string adapter_name(const Properties& props) {
+        return std::string(props.get<std::string_view>("adapter", "layered3-5x64"));
+    }
 
-    // The parameters that it takes: those of its class, or none where it knows a single material, whose own may be given all
-    // the same.
+    // The parameters that it takes: those of its class, or none where it knows a single material, whose own may be
+    // given all the same.
     static std::vector<SourceParam> wanted(const Properties& props, const nma::Adapter& adapter) {
         if (adapter.material().empty()) return adapter.parameters();
         const float* known = adapter.material().data();
@@ -80,12 +92,16 @@ private:
     static void refuse_others(const Properties& props, SourceParam p, const float* known) {
         p.low = -1e30, p.high = 1e30;
         const Inputs given(props, {p}, false);
-        if (given.textured()) Throw("the adapter knows a single material, so that no texture can drive %s; leave it out", p.name);
+        if (given.textured())
+            Throw("the adapter knows a single material, so that no texture can drive %s; leave it out", p.name);
         float numbers[MOST_PARAMETERS];
         given.at(dr::zeros<SurfaceInteraction3f>(), numbers);
         for (int c = 0; c < p.size; ++c)
             if (nma::absolute(numbers[c] - known[c]) > 1e-5f * nma::absolute(known[c]) + 1e-8f)
-                Throw("the adapter knows a single material, whose %s is %g, not %g; fit one to that material, or take the adapter of a class", p.name, known[c], numbers[c]);
+                Throw(
+                    "the adapter knows a single material, whose %s is %g, not %g; fit one to that material, or take "
+                    "the adapter of a class",
+                    p.name, known[c], numbers[c]);
     }
 
     // Curves of the present inputs, where a material has such.
@@ -105,10 +121,12 @@ private:
             Throw("precision is float32, compact or bfloat16, not '%s'", precision);
         nma::Options options;
         options.compact = precision != "float32";
-        if (precision == "bfloat16" && nma::supported(nma::InstructionSet::avx512_bf16)) options.set = nma::InstructionSet::avx512_bf16;
+        if (precision == "bfloat16" && nma::supported(nma::InstructionSet::avx512_bf16))
+            options.set = nma::InstructionSet::avx512_bf16;
         try {
             nma::Adapter adapter = nma::Adapter::load(fs::exists(path) ? path.string() : name, options);
-            if (adapter.parameter_count() > MOST_PARAMETERS) throw nma::Error(name + ": a class of too many parameters");
+            if (adapter.parameter_count() > MOST_PARAMETERS)
+                throw nma::Error(name + ": a class of too many parameters");
             return adapter;
         } catch (const nma::Error& e) {
             Throw("%s", e.what());
@@ -120,17 +138,22 @@ private:
         if (curves_ && inputs_.settled(si)) return curves_->at(cosine);
         float parameters[MOST_PARAMETERS];
         inputs_.at(si, parameters);
-        return adapter_.prepare(parameters, nma::Direction{static_cast<float>(si.wi.x()), static_cast<float>(si.wi.y()), cosine});
+        return adapter_.prepare(parameters,
+                                nma::Direction{static_cast<float>(si.wi.x()), static_cast<float>(si.wi.y()), cosine});
     }
 
-    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override { return prepare(si).albedo(direction(si.wi)); }
+    nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override {
+        return prepare(si).albedo(direction(si.wi));
+    }
 
-    std::pair<Spectrum, Float> evaluated(const BSDFContext& context, const nma::Material& material, const SurfaceInteraction3f& si, const Vector3f& wo) const {
+    std::pair<Spectrum, Float> evaluated(const BSDFContext& context, const nma::Material& material,
+                                         const SurfaceInteraction3f& si, const Vector3f& wo) const {
         const nma::Value v = material.eval(direction(si.wi), direction(wo));
         return {seen(context, si, wo, v.value), v.pdf};
     }
 
-    std::pair<BSDFSample3f, Spectrum> sampled(const BSDFContext& context, const nma::Material& material, const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
+    std::pair<BSDFSample3f, Spectrum> sampled(const BSDFContext& context, const nma::Material& material,
+                                              const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
         const nma::Sampled s = material.sample(direction(si.wi), u, u2.x(), u2.y());
         BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
         if (!(s.pdf > 0.0f)) return {drawn, 0.0f};
@@ -141,9 +164,10 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value for a path from the camera; on one from the light, the camera is towards wo, and the blend is prepared there,
-    // so that both see the same. Swapping the directions of a blend gives another value.
-    Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, const nma::Vec3<float>& value) const {
+    // The value for a path from the camera; on one from the light, the camera is towards wo, and the blend is prepared
+    // there, so that both see the same. Swapping the directions of a blend gives another value.
+    Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
+                  const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);
         if (!(wo.z() > 0.0f)) return 0.0f;
         SurfaceInteraction3f turned = si;

@@ -19,12 +19,14 @@ public:
     using Inputs = nma_plugin::Inputs<Float, Spectrum>;
     using Input = typename Inputs::Input;
 
-    SourceBSDF(const Properties& props, const std::vector<SourceParam>& parameters, bool trained) : Base(props), inputs_(props, parameters, trained) {
+    SourceBSDF(const Properties& props, const std::vector<SourceParam>& parameters, bool trained)
+        : Base(props), inputs_(props, parameters, trained) {
         m_flags = inputs_.flags();
         m_components.push_back(m_flags);
     }
 
-    Spectrum eval(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo, Mask active) const override {
+    Spectrum eval(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
+                  Mask active) const override {
         return this->eval_pdf(context, si, wo, active).first;
     }
 
@@ -38,9 +40,12 @@ public:
     void traverse(TraversalCallback* callback) override { inputs_.traverse(callback); }
     void parameters_changed(const std::vector<std::string>&) override { inputs_.changed(); }
 
-    Mask has_attribute(const std::string& name, Mask active) const override { return inputs_.find(name) || Base::has_attribute(name, active); }
+    Mask has_attribute(const std::string& name, Mask active) const override {
+        return inputs_.find(name) || Base::has_attribute(name, active);
+    }
 
-    UnpolarizedSpectrum eval_attribute(const std::string& name, const SurfaceInteraction3f& si, Mask active) const override {
+    UnpolarizedSpectrum eval_attribute(const std::string& name, const SurfaceInteraction3f& si,
+                                       Mask active) const override {
         const Input* input = inputs_.find(name);
         return input ? UnpolarizedSpectrum(inputs_.at(*input, si)) : Base::eval_attribute(name, si, active);
     }
@@ -67,11 +72,12 @@ protected:
 };
 
 // Registers a plugin for `scalar_rgb` alone: other variants have the Python BSDF of the same name.
-#define NMA_EXPORT_SCALAR_PLUGIN(Name)                                                                         \
-    template class Name<float, Color<float, 3>>;                                                               \
-    extern "C" MI_EXPORT void init_plugin(std::string_view name, PluginRegisterFn add) {                       \
-        using Plugin = Name<float, Color<float, 3>>;                                                           \
-        add(name, "scalar_rgb", Plugin::Type, [](void*, const Properties& p) -> ref<Object> { return new Plugin(p); }); \
+#define NMA_EXPORT_SCALAR_PLUGIN(Name)                                                   \
+    template class Name<float, Color<float, 3>>;                                         \
+    extern "C" MI_EXPORT void init_plugin(std::string_view name, PluginRegisterFn add) { \
+        using Plugin = Name<float, Color<float, 3>>;                                     \
+        add(name, "scalar_rgb", Plugin::Type,                                            \
+            [](void*, const Properties& p) -> ref<Object> { return new Plugin(p); });    \
     }
 
 }  // namespace mitsuba::nma_plugin

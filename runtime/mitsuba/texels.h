@@ -28,7 +28,8 @@ public:
     explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
 
     std::vector<Texels> found;
-    // Whether each of those textures showed something: others, such as mesh attributes, know their numbers only while rendering.
+    // Whether each of those textures showed something. Others, such as mesh attributes, know their numbers only while
+    // they render.
     bool complete = true;
 
 protected:
@@ -42,7 +43,8 @@ protected:
     }
 
     void put_value(std::string_view name, void* value, uint32_t, const std::type_info& type) override {
-        if (name == "data" && !(pixels<float>(value, type) || pixels<dr::half>(value, type) || pixels<uint8_t>(value, type)))
+        if (name == "data" &&
+            !(pixels<float>(value, type) || pixels<dr::half>(value, type) || pixels<uint8_t>(value, type)))
             Throw("a texture keeps its pixels as %s, which this plugin does not read", type.name());
         if (name != "value") return;
         if (type == typeid(Float)) found.push_back({{static_cast<float>(*static_cast<Float*>(value))}, 1, 1});
@@ -59,7 +61,10 @@ private:
         using Tensor = dr::Tensor<dr::DynamicArray<T>>;
         if (type != typeid(Tensor)) return false;
         const auto& tensor = *static_cast<Tensor*>(value);
-        Texels texels{{}, tensor.ndim() > 1 ? tensor.shape(1) : 1, tensor.ndim() > 2 ? tensor.shape(2) : 1, std::is_same_v<T, uint8_t>};
+        Texels texels{{},
+                      tensor.ndim() > 1 ? tensor.shape(1) : 1,
+                      tensor.ndim() > 2 ? tensor.shape(2) : 1,
+                      std::is_same_v<T, uint8_t>};
         // Mitsuba decodes bytes when it looks them up, from sRGB unless the texture is `raw`.
         const bool srgb = texels.bytes && shown_->to_string().find("raw = 1") == std::string::npos;
         for (std::size_t k = 0; k < tensor.size(); ++k) {

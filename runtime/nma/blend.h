@@ -1,4 +1,4 @@
-// The blend of Principled BRDFs: one evaluation, one density and one sample over all lobes. Twin of nma/target/blend.py.
+// The blend of Principled BRDFs: one evaluation, one density, one sample over all lobes. Twin of nma/target/blend.py.
 //
 // Directions are unit vectors in the local frame, z up, `wi` towards the viewer and `wo` towards the light.
 #pragma once
@@ -76,8 +76,8 @@ struct Sample {
     T pdf;
 };
 
-// Works out the odds of a blend's lobes at cos(theta_i), and with `bounded` dims it where it might reflect more light than
-// it receives.
+// Works out the odds of a blend's lobes at cos(theta_i), and with `bounded` dims it where it might reflect more light
+// than it receives.
 template <class T>
 inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
     const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
@@ -91,7 +91,8 @@ inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
         const Vec3<Lanes<T>> albedo = (a.diffuse + a.clearcoat + a.spec) * w;
         sum += sums(albedo.x, albedo.y, albedo.z, albedo.x + albedo.y + albedo.z);
     }
-    const Lanes<T> inverse = Lanes<T>(T(1), T(1), T(1), T(3)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0))), share = inverse[3];
+    const Lanes<T> inverse = Lanes<T>(T(1), T(1), T(1), T(3)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0)));
+    const Lanes<T> share = inverse[3];
     for (int n = 0; n < blend.used(); ++n) {
         Odds<Lanes<T>>& o = blend.packs[n].odds;
         o = {o.diffuse * share, o.spec * share, o.clearcoat * share};
@@ -117,16 +118,17 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
         const Pack<T>& pack = blend.packs[n];
         const Lobes<Lanes<T>> lobes = eval_pdf_lobes<Lanes<T>>(pack.instances, wide);
         result.value = result.value + sum(lobes.value * pack.weights);
-        result.pdf += sum(pack.odds.diffuse * lobes.diffuse_pdf + pack.odds.spec * lobes.spec_pdf + pack.odds.clearcoat * lobes.clearcoat_pdf);
+        result.pdf += sum(pack.odds.diffuse * lobes.diffuse_pdf + pack.odds.spec * lobes.spec_pdf +
+                          pack.odds.clearcoat * lobes.clearcoat_pdf);
     }
     result.value = result.value * blend.scale;
     return result;
 }
 
-// The instance that `u` falls to when each takes its share from `start` on, which moves to the end of that share; `count`
-// if there is none.
+// The instance that `u` falls to when each takes its share from `start` on, which moves to the end of that share;
+// `count` if there is none.
 template <class T>
-inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::*lobe, T u, T& start) {
+inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::* lobe, T u, T& start) {
     int k = 0;
     while (k < blend.count && u >= (start += (blend.packs[k / LANES].odds.*lobe)[k % LANES])) ++k;
     return k;
@@ -148,7 +150,8 @@ inline Sample<T> sample(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1
         wo = sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
     } else {
         k = std::min(chosen(blend, &Odds<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);
-        wo = sample_clearcoat<T>(wi, clearcoat_alpha<T>(blend.packs[k / LANES].instances.clearcoat_gloss[k % LANES]), u1, u2);
+        const T gloss = blend.packs[k / LANES].instances.clearcoat_gloss[k % LANES];
+        wo = sample_clearcoat<T>(wi, clearcoat_alpha<T>(gloss), u1, u2);
     }
     const Evaluation<T> found = eval_pdf(blend, wi, wo);
     return {wo, found.value, found.pdf};

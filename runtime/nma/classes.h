@@ -8,14 +8,15 @@
 namespace nma {
 
 inline std::vector<SourceParam> layered3_parameters() {
-    return {
-        {"alpha_top", 1, true, 0.0001, 1.0, 0.0f, 1.0f},
-        {"alpha_bottom", 1, true, 0.0001, 1.0, 0.0f, 1.0f},
-        {"eta_top", 1, false, 1.0, 4.0, 0.0f, 1.0f},
-        {"eta_conductor", 3, false, 0.0, 10000.0, 0.0f, 1.0f},
-        {"k_conductor", 3, false, 0.0, 10000.0, 0.0f, 1.0f},
-        {"albedo", 3, false, 0.0, 1.0, 0.0f, 1.0f},
-        {"sigma_t", 1, false, 0.0, 1000.0, 0.0f, 1.0f}};
+    std::vector<SourceParam> made(7);
+    made[0] = {"alpha_top", 1, true, 0.0001, 1.0, 0.0f, 1.0f};
+    made[1] = {"alpha_bottom", 1, true, 0.0001, 1.0, 0.0f, 1.0f};
+    made[2] = {"eta_top", 1, false, 1.0, 4.0, 0.0f, 1.0f};
+    made[3] = {"eta_conductor", 3, false, 0.0, 10000.0, 0.0f, 1.0f};
+    made[4] = {"k_conductor", 3, false, 0.0, 10000.0, 0.0f, 1.0f};
+    made[5] = {"albedo", 3, false, 0.0, 1.0, 0.0f, 1.0f};
+    made[6] = {"sigma_t", 1, false, 0.0, 1000.0, 0.0f, 1.0f};
+    return made;
 }
 
 }  // namespace nma

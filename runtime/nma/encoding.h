@@ -16,9 +16,11 @@ public:
     explicit Encoding(const Weights& weights) : kind_(kind_named(weights.encoding)), directional_(weights.directional) {
         for (const SourceParam& p : weights.parameters) parameters_ += p.size;
         if (kind_ != Kind::Layered3) return;
-        if (parameters_ != 13 || weights.parameters.size() != 7) throw Error("the encoding 'layered3' belongs to another class");
+        if (parameters_ != 13 || weights.parameters.size() != 7)
+            throw Error("the encoding 'layered3' belongs to another class");
         int k = 0;
-        for (const SourceParam* p : {&weights.parameters[0], &weights.parameters[1], &weights.parameters[2], &weights.parameters[6]}) {
+        for (const SourceParam* p :
+             {&weights.parameters[0], &weights.parameters[1], &weights.parameters[2], &weights.parameters[6]}) {
             log_.set(k, p->logarithmic);
             start_.set(k, p->start);
             per_range_.set(k++, p->per_range);
@@ -29,10 +31,14 @@ public:
     int parameters() const { return parameters_; }
     int size() const {
         switch (kind_) {
-            case Kind::Raw: return parameters_ + directional_;
-            case Kind::Direction: return 1;
-            case Kind::Azimuth: return 5;
-            default: return 13 + 3 * directional_;
+            case Kind::Raw:
+                return parameters_ + directional_;
+            case Kind::Direction:
+                return 1;
+            case Kind::Azimuth:
+                return 5;
+            default:
+                return 13 + 3 * directional_;
         }
     }
     // Whether the view's azimuth matters: `encode` reads all of wi, otherwise wi.z alone.
@@ -41,7 +47,8 @@ public:
     // The network's first layer for numbers in the order of `encode`.
     Layer arranged(const Layer& first) const {
         if (kind_ != Kind::Layered3) return first;
-        Layer made{4 * LANES, first.out, std::vector<float>(4 * LANES * static_cast<std::size_t>(first.out)), first.bias};
+        Layer made{4 * LANES, first.out, std::vector<float>(4 * LANES * static_cast<std::size_t>(first.out)),
+                   first.bias};
         for (int j = 0; j < first.out; ++j)
             for (int i = 0; i < first.in; ++i) made.matrix[j * made.in + place(i)] = first.matrix[j * first.in + i];
         return made;

@@ -1,4 +1,4 @@
-// A reader for JSON (RFC 8259), as far as the headers of weights files need it: a tree of values, strict, bounded depth.
+// A reader for JSON (RFC 8259) as far as weights files need it: a tree of values, strict, of bounded depth.
 //
 // Of types that are not complete yet, the standard allows vectors, but no pairs.
 #pragma once
@@ -69,7 +69,8 @@ private:
     char peek() const { return place_ < text_.size() ? text_[place_] : '\0'; }
 
     void space() {
-        while (place_ < text_.size() && std::string_view(" \t\r\n").find(text_[place_]) != std::string_view::npos) ++place_;
+        while (place_ < text_.size() && std::string_view(" \t\r\n").find(text_[place_]) != std::string_view::npos)
+            ++place_;
     }
 
     bool take(std::string_view word) {
@@ -86,13 +87,33 @@ private:
         space();
         Json made;
         switch (peek()) {
-            case '{': made.kind = Json::Kind::Object; fields(made, deeper(depth)); break;
-            case '[': made.kind = Json::Kind::Array; items(made, deeper(depth)); break;
-            case '"': made.kind = Json::Kind::String; made.string = string(); break;
-            case 't': expect("true"); made.kind = Json::Kind::Boolean; made.boolean = true; break;
-            case 'f': expect("false"); made.kind = Json::Kind::Boolean; break;
-            case 'n': expect("null"); break;
-            default: made.kind = Json::Kind::Number; made.number = number();
+            case '{':
+                made.kind = Json::Kind::Object;
+                fields(made, deeper(depth));
+                break;
+            case '[':
+                made.kind = Json::Kind::Array;
+                items(made, deeper(depth));
+                break;
+            case '"':
+                made.kind = Json::Kind::String;
+                made.string = string();
+                break;
+            case 't':
+                expect("true");
+                made.kind = Json::Kind::Boolean;
+                made.boolean = true;
+                break;
+            case 'f':
+                expect("false");
+                made.kind = Json::Kind::Boolean;
+                break;
+            case 'n':
+                expect("null");
+                break;
+            default:
+                made.kind = Json::Kind::Number;
+                made.number = number();
         }
         return made;
     }
@@ -131,7 +152,9 @@ private:
 
     double number() {
         const std::size_t first = place_;
-        while (place_ < text_.size() && std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos) ++place_;
+        while (place_ < text_.size() &&
+               std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos)
+            ++place_;
         // Unlike strtod, a stream with this locale reads a point as one in every host program.
         std::istringstream digits(std::string(text_.substr(first, place_ - first)));
         digits.imbue(std::locale::classic());

@@ -32,20 +32,38 @@ template <class T, class F>
 inline Four<T> each(F function) {
     return {{function(0), function(1), function(2), function(3)}};
 }
-template <class T> inline Four<T> operator+(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] + b[k]; }); }
-template <class T> inline Four<T> operator-(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] - b[k]; }); }
-template <class T> inline Four<T> operator*(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] * b[k]; }); }
-template <class T> inline Four<T> operator/(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return a[k] / b[k]; }); }
-template <class T> inline Four<T> least(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return minimum(a[k], b[k]); }); }
-template <class T> inline Four<T> most(const Four<T>& a, const Four<T>& b) { return each<T>([&](int k) { return maximum(a[k], b[k]); }); }
-template <class T> inline Four<T> roots(const Four<T>& a) { return each<T>([&](int k) { return std::sqrt(a[k]); }); }
+template <class T> inline Four<T> operator+(const Four<T>& a, const Four<T>& b) {
+    return each<T>([&](int k) { return a[k] + b[k]; });
+}
+template <class T> inline Four<T> operator-(const Four<T>& a, const Four<T>& b) {
+    return each<T>([&](int k) { return a[k] - b[k]; });
+}
+template <class T> inline Four<T> operator*(const Four<T>& a, const Four<T>& b) {
+    return each<T>([&](int k) { return a[k] * b[k]; });
+}
+template <class T> inline Four<T> operator/(const Four<T>& a, const Four<T>& b) {
+    return each<T>([&](int k) { return a[k] / b[k]; });
+}
+template <class T> inline Four<T> least(const Four<T>& a, const Four<T>& b) {
+    return each<T>([&](int k) { return minimum(a[k], b[k]); });
+}
+template <class T> inline Four<T> most(const Four<T>& a, const Four<T>& b) {
+    return each<T>([&](int k) { return maximum(a[k], b[k]); });
+}
+template <class T> inline Four<T> roots(const Four<T>& a) {
+    return each<T>([&](int k) { return std::sqrt(a[k]); });
+}
 template <class T> inline Four<T> sums(const Four<T>& a, const Four<T>& b, const Four<T>& c, const Four<T>& d) {
     const auto sum = [](const Four<T>& v) { return (v[0] + v[2]) + (v[1] + v[3]); };
     return {{sum(a), sum(b), sum(c), sum(d)}};
 }
-template <class T> inline Four<T> logarithms(const Four<T>& a) { return each<T>([&](int k) { return std::log(a[k]); }); }
+template <class T> inline Four<T> logarithms(const Four<T>& a) {
+    return each<T>([&](int k) { return std::log(a[k]); });
+}
 
-template <class T> inline Four<T> exponentials(const Four<T>& a) { return each<T>([&](int k) { return std::exp(a[k]); }); }
+template <class T> inline Four<T> exponentials(const Four<T>& a) {
+    return each<T>([&](int k) { return std::exp(a[k]); });
+}
 
 template <class T>
 struct Storage {
@@ -100,9 +118,12 @@ inline Floats logarithms(Floats a) {
 // To two units in the last place for |a| <= 87: 2^n times the series of the rest, which is at most log(2) / 2.
 inline Floats exponentials(Floats a) {
     const Floats octaves = a * 1.44269504f;
-    const Whole n = __builtin_convertvector(octaves + (octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f}), Whole);
-    const Floats whole = __builtin_convertvector(n, Floats), r = a - whole * 0.693145752f - whole * 1.42860677e-6f, r2 = r * r;
-    const Floats low = (1.0f + r) + r2 * (0.5f + r * 0.166666667f), high = (0.0416666667f + r * 0.00833333333f) + r2 * (0.00138888889f + r * 1.98412698e-4f);
+    const Floats half = octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f};
+    const Whole n = __builtin_convertvector(octaves + half, Whole);
+    const Floats whole = __builtin_convertvector(n, Floats);
+    const Floats r = a - whole * 0.693145752f - whole * 1.42860677e-6f, r2 = r * r;
+    const Floats low = (1.0f + r) + r2 * (0.5f + r * 0.166666667f);
+    const Floats high = (0.0416666667f + r * 0.00833333333f) + r2 * (0.00138888889f + r * 1.98412698e-4f);
     return (low + high * (r2 * r2)) * (Floats)((n + 127) << 23);
 }
 #endif
@@ -141,7 +162,9 @@ template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(ma
 
 template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
 // The sums of four, side by side.
-template <class T> inline Lanes<T> sums(const Lanes<T>& a, const Lanes<T>& b, const Lanes<T>& c, const Lanes<T>& d) { return detail::sums(a.v, b.v, c.v, d.v); }
+template <class T> inline Lanes<T> sums(const Lanes<T>& a, const Lanes<T>& b, const Lanes<T>& c, const Lanes<T>& d) {
+    return detail::sums(a.v, b.v, c.v, d.v);
+}
 template <class T> inline Vec3<T> sum(const Vec3<Lanes<T>>& a) { return {sum(a.x), sum(a.y), sum(a.z)}; }
 
 }  // namespace nma

@@ -34,7 +34,8 @@ public:
     std::uint32_t next() {
         const std::uint64_t old = state_;
         state_ = old * 6364136223846793005ull + increment_;
-        const std::uint32_t mixed = static_cast<std::uint32_t>((old >> 18 ^ old) >> 27), turn = static_cast<std::uint32_t>(old >> 59);
+        const auto mixed = static_cast<std::uint32_t>((old >> 18 ^ old) >> 27);
+        const auto turn = static_cast<std::uint32_t>(old >> 59);
         return mixed >> turn | mixed << (-turn & 31);
     }
 
@@ -54,7 +55,8 @@ struct Layers {
     // From the 13 numbers of the class `layered3`.
     static Layers of(const float* p) {
         const float eta = p[2] < 1.0f + INDEX_MATCHED ? 1.0f : p[2], inverse = 1.0f / eta;
-        return {p[0], p[1], eta, Vec{p[3], p[4], p[5]} * inverse, Vec{p[6], p[7], p[8]} * inverse, {p[9], p[10], p[11]}, p[12]};
+        const Vec eta_conductor{p[3], p[4], p[5]}, k_conductor{p[6], p[7], p[8]}, albedo{p[9], p[10], p[11]};
+        return {p[0], p[1], eta, eta_conductor * inverse, k_conductor * inverse, albedo, p[12]};
     }
 };
 
@@ -73,7 +75,8 @@ inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); 
 
 inline Vec conductor(float cosine, const Layers& layers) {
     const Vec &eta = layers.eta_bottom, &k = layers.k_bottom;
-    return {fresnel_conductor<float>(cosine, eta.x, k.x), fresnel_conductor<float>(cosine, eta.y, k.y), fresnel_conductor<float>(cosine, eta.z, k.z)};
+    return {fresnel_conductor<float>(cosine, eta.x, k.x), fresnel_conductor<float>(cosine, eta.y, k.y),
+            fresnel_conductor<float>(cosine, eta.z, k.z)};
 }
 
 // Fraction that passes `depth` of the slab along `w` without meeting the medium.
@@ -84,7 +87,8 @@ inline float transmittance(const Layers& layers, float depth, const Vec& w) {
 // Russian roulette on the brightest channel.
 inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     if (exempt) return;
-    const float chance = minimum(max_component(walk.throughput) * (1.0f / ROULETTE_THRESHOLD), trapped ? TRAPPED_SURVIVAL : 1.0f);
+    const float chance =
+        minimum(max_component(walk.throughput) * (1.0f / ROULETTE_THRESHOLD), trapped ? TRAPPED_SURVIVAL : 1.0f);
     if (chance < 1.0f && random.uniform() >= chance) {
         walk.throughput = {0.0f, 0.0f, 0.0f};
         walk.alive = false;
@@ -100,7 +104,8 @@ inline bool step(const Layers& layers, float sigma_t, Walk& walk, Random& random
     if (walk.inside && sigma_t > 0.0f) {
         const float height = walk.height - d.z * (log(1.0f - random.uniform()) / sigma_t);
         if (height > 0.0f && height < 1.0f) {
-            const float z = 1.0f - 2.0f * random.uniform(), phi = 2.0f * PI<float> * random.uniform(), r = safe_sqrt(1.0f - z * z);
+            const float z = 1.0f - 2.0f * random.uniform(), r = safe_sqrt(1.0f - z * z);
+            const float phi = 2.0f * PI<float> * random.uniform();
             walk.direction = {r * cos(phi), r * sin(phi), z};
             walk.height = height;
             walk.throughput = walk.throughput * layers.albedo;
@@ -195,7 +200,8 @@ inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
 }
 
 // Light from wi to wo that meets interfaces only, and a segment of the walk `there` after its first.
-inline Vec unscattered(const Layers& layers, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back, Random& random, bool forward, Way& detour) {
+inline Vec unscattered(const Layers& layers, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
+                       Random& random, bool forward, Way& detour) {
     const Vec drawn_up = -back.direction;
     const bool matched = layers.eta_top == 1.0f;
     const auto [drawn_q, drawn_t] = out_through_coat(layers, wo, drawn_up);
@@ -222,7 +228,8 @@ inline Vec unscattered(const Layers& layers, const Vec& wi, const Walk& there, c
         if (share > 0.0f && drawn_passes > 0.0f) {
             const Vec view = above(w_in);
             const float cosine = dot(view, normalize(view + drawn_up));
-            const float weight = share * drawn_passes * mirror_pdf(view, drawn_up, layers.alpha_bottom) * smith_g1<float>(drawn_up, layers.alpha_bottom, layers.alpha_bottom);
+            const float weight = share * drawn_passes * mirror_pdf(view, drawn_up, layers.alpha_bottom) *
+                                 smith_g1<float>(drawn_up, layers.alpha_bottom, layers.alpha_bottom);
             total = total + before.throughput * conductor(cosine, layers) * weight;
         }
         // The way out left to chance.
@@ -270,8 +277,10 @@ inline Vec refract_flat(const Vec& w, float eta) {
 // f cos(theta_o) of the coat's upper side alone [1/sr].
 inline float coat_reflection(const Layers& layers, const Vec& wi, const Vec& wo) {
     const Vec m = normalize(wi + wo);
-    const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), layers.eta_top)), alpha = layers.alpha_top;
-    return fresnel * ggx_d<float>(m, alpha, alpha) * smith_g1<float>(wi, alpha, alpha) * smith_g1<float>(wo, alpha, alpha) / (4.0f * maximum(wi.z, 1e-7f));
+    const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), layers.eta_top));
+    const float alpha = layers.alpha_top;
+    const float masking = smith_g1<float>(wi, alpha, alpha) * smith_g1<float>(wo, alpha, alpha);
+    return fresnel * ggx_d<float>(m, alpha, alpha) * masking / (4.0f * maximum(wi.z, 1e-7f));
 }
 
 // One unbiased estimate of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
@@ -284,7 +293,8 @@ inline Vec evaluate(const Layers& layers, const Vec& wi, const Vec& wo, Random& 
     const detail::Way ways[2] = {{back.direction, back.throughput}, detour};
     const Vec through = detail::scattered(layers, there, ways, random);
     const float index2 = layers.eta_top * layers.eta_top;
-    return forward + backward * (wo.z / maximum(wi.z, 1e-7f)) + through * (wo.z / index2) + coat_reflection(layers, wi, wo);
+    return forward + backward * (wo.z / maximum(wi.z, 1e-7f)) + through * (wo.z / index2) +
+           coat_reflection(layers, wi, wo);
 }
 
 // One whole walk from `wi` (wi.z > 0): the direction in which it left, or a throughput of 0.
@@ -306,7 +316,8 @@ struct Density {
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cos_i, eta);
         const float crossing = layers.alpha_top * (eta * cos_t - cos_i) / (2.0f * eta * cos_t);
         const float width2 = layers.alpha_bottom * layers.alpha_bottom + 2.0f * crossing * crossing;
-        const float critical = 1.0f / (eta + safe_sqrt(eta * eta - 1.0f)), trapped = width2 / (width2 + critical * critical);
+        const float critical = 1.0f / (eta + safe_sqrt(eta * eta - 1.0f));
+        const float trapped = width2 / (width2 + critical * critical);
         const float passes = (1.0f - fresnel) * exp(-2.0f * layers.sigma_t / cos_t);
         bottom = passes * mean(detail::conductor(cos_t, layers));
         diffuse = LEAST_DIFFUSE + 0.5f * ((1.0f - fresnel - passes) * mean(layers.albedo) + bottom * trapped);
@@ -323,8 +334,9 @@ inline float pdf(const Layers& layers, const Density& density, const Vec& wi, co
     if (!(wo.z > 0.0f)) return 0.0f;
     const Vec inside_o = detail::refract_flat(wo, layers.eta_top);
     const float jacobian = wo.z / (layers.eta_top * layers.eta_top * inside_o.z);
-    return density.coat * detail::mirror_pdf(detail::above(wi), wo, layers.alpha_top) + density.bottom * detail::mirror_pdf(density.inside, inside_o, density.width) * jacobian +
-           density.diffuse * INV_PI<float> * wo.z;
+    const float mirrored = density.coat * detail::mirror_pdf(detail::above(wi), wo, layers.alpha_top);
+    const float seen = density.bottom * detail::mirror_pdf(density.inside, inside_o, density.width) * jacobian;
+    return mirrored + seen + density.diffuse * INV_PI<float> * wo.z;
 }
 
 // A direction with its density [1/sr]; a density of 0 marks an invalid one.
@@ -333,9 +345,9 @@ struct Drawn {
     float pdf;
 };
 
-// A direction from `pdf` itself, by three uniform numbers in [0, 1). Its weight is `evaluate` over the density, which varies
-// more than a walk's throughput; but where samples of several materials are recombined by their densities, walks will not do:
-// no density is known that their directions follow.
+// A direction from `pdf` itself, by three uniform numbers in [0, 1). Its weight is `evaluate` over the density, which
+// varies more than a walk's throughput; but where samples of several materials are recombined by their densities, walks
+// will not do: no density is known that their directions follow.
 inline Drawn sample(const Layers& layers, const Density& density, const Vec& wi, float u_lobe, float u1, float u2) {
     Vec wo;
     if (u_lobe < density.coat) {

@@ -31,8 +31,8 @@ inline std::uint32_t bits(float x) {
     std::memcpy(&found, &x, sizeof(found));
     return found;
 }
-// With -ffast-math compilers take every number for finite; only its bits tell. Those of infinity are 0x7f800000, but for the
-// sign, and those of NaN lie beyond.
+// With -ffast-math compilers take every number for finite; only its bits tell. Those of infinity are 0x7f800000, but
+// for the sign, and those of NaN lie beyond.
 inline bool is_finite(float x) { return (bits(x) & 0x7fffffff) < 0x7f800000; }
 inline bool is_nan(float x) { return (bits(x) & 0x7fffffff) > 0x7f800000; }
 
@@ -42,10 +42,16 @@ struct Vec3 {
     T x, y, z;
 };
 
-template <class T> inline Vec3<T> operator+(const Vec3<T>& a, const Vec3<T>& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-template <class T> inline Vec3<T> operator-(const Vec3<T>& a, const Vec3<T>& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class T> inline Vec3<T> operator+(const Vec3<T>& a, const Vec3<T>& b) {
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class T> inline Vec3<T> operator-(const Vec3<T>& a, const Vec3<T>& b) {
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
 template <class T> inline Vec3<T> operator-(const Vec3<T>& a) { return {-a.x, -a.y, -a.z}; }
-template <class T> inline Vec3<T> operator*(const Vec3<T>& a, const Vec3<T>& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+template <class T> inline Vec3<T> operator*(const Vec3<T>& a, const Vec3<T>& b) {
+    return {a.x * b.x, a.y * b.y, a.z * b.z};
+}
 template <class T> inline Vec3<T> operator*(const Vec3<T>& a, T t) { return {a.x * t, a.y * t, a.z * t}; }
 template <class T> inline Vec3<T> operator+(const Vec3<T>& a, T t) { return {a.x + t, a.y + t, a.z + t}; }
 
@@ -53,6 +59,8 @@ template <class T> inline T dot(const Vec3<T>& a, const Vec3<T>& b) { return a.x
 template <class T> inline Vec3<T> normalize(const Vec3<T>& v) { return v * (T(1) / sqrt(dot(v, v))); }
 template <class T> inline T mean(const Vec3<T>& c) { return (c.x + c.y + c.z) * (T(1) / T(3)); }
 // Luminance of linear sRGB (ITU-R BT.709 primaries).
-template <class T> inline T luminance(const Vec3<T>& c) { return T(0.212671) * c.x + T(0.715160) * c.y + T(0.072169) * c.z; }
+template <class T> inline T luminance(const Vec3<T>& c) {
+    return T(0.212671) * c.x + T(0.715160) * c.y + T(0.072169) * c.z;
+}
 
 }  // namespace nma

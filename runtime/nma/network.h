@@ -37,13 +37,15 @@ public:
 
     // With `compact`, or for avx512_bf16, weights are rounded to bfloat16, which takes half the memory.
     Network(const std::vector<Layer>& layers, InstructionSet set, bool compact) : kernels_(&kernels(set)) {
-        if (layers.size() > DEEPEST_NETWORK) throw Error("a network of more than " + std::to_string(DEEPEST_NETWORK) + " layers");
+        if (layers.size() > DEEPEST_NETWORK)
+            throw Error("a network of more than " + std::to_string(DEEPEST_NETWORK) + " layers");
         view_.depth = static_cast<int>(layers.size());
         const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
         int in = detail::padded(layers.front().in, INPUT_STEP);
         for (std::size_t k = 0; k < layers.size(); ++k) {
             const int out = layers[k].out + (k + 1 == layers.size());
-            if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER) throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
+            if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER)
+                throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
             LayerView& view = view_.layers[k];
             view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
             view.bias = keep(layers[k].bias, view.width);
@@ -51,7 +53,8 @@ public:
             else view.columns = keep_columns(layers[k], view);
             in = view.width;
         }
-        view_.narrow = !pairs && std::all_of(view_.layers, view_.layers + view_.depth, [](const LayerView& layer) { return layer.width == NARROW; });
+        const auto narrow = [](const LayerView& layer) { return layer.width == NARROW; };
+        view_.narrow = !pairs && std::all_of(view_.layers, view_.layers + view_.depth, narrow);
         if (view_.narrow)
             for (int k = 0; k < view_.depth; ++k) view_.layers[k].turned = keep_turned(view_.layers[k]);
     }
@@ -60,8 +63,8 @@ public:
     const Kernels& kernels_in_use() const { return *kernels_; }
     const NetworkView& view() const { return view_; }
 
-    // Rows of inputs and outputs have room for these many numbers. Inputs beyond the network's own are 0, and so are outputs,
-    // of which there is at least one.
+    // Rows of inputs and outputs have room for these many numbers. Inputs beyond the network's own are 0, and so are
+    // outputs, of which there is at least one.
     int input_stride() const { return view_.layers[0].in; }
     int output_stride() const { return view_.layers[view_.depth - 1].width; }
 
@@ -95,14 +98,16 @@ private:
         float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
         for (int i = 0; i < view.in; ++i)
             for (int j = 0; j < view.width; ++j)
-                to[(j / WIDTH_STEP * view.in + i) * WIDTH_STEP + j % WIDTH_STEP] = view.columns[(i / 4 * 4 + j % 4) * view.width + j / 4 * 4 + (j + i) % 4];
+                to[(j / WIDTH_STEP * view.in + i) * WIDTH_STEP + j % WIDTH_STEP] =
+                    view.columns[(i / 4 * 4 + j % 4) * view.width + j / 4 * 4 + (j + i) % 4];
         return to;
     }
 
     const std::uint32_t* keep_pairs(const Layer& layer, const LayerView& view) {
         std::uint32_t* to = room(pairs_, static_cast<std::size_t>(view.in / 2) * view.width);
         for (int j = 0; j < layer.out; ++j)
-            for (int i = 0; i < layer.in; ++i) to[i / 2 * view.width + j] |= detail::bfloat16(layer.matrix[j * layer.in + i]) << 16 * (i % 2);
+            for (int i = 0; i < layer.in; ++i)
+                to[i / 2 * view.width + j] |= detail::bfloat16(layer.matrix[j * layer.in + i]) << 16 * (i % 2);
         return to;
     }
 

@@ -24,7 +24,9 @@ struct Indexed {
     const float* numbers;
 
     explicit Indexed(const float* all) : numbers(all) {}
-    Lanes<float> operator()(const int* index) const { return {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]}; }
+    Lanes<float> operator()(const int* index) const {
+        return {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
+    }
 };
 
 // The instances and weights of a blend from their numbers, which `pick` brings to lanes.

@@ -176,15 +176,14 @@ inline Geometry<T> geometry(const Vec3<T>& wi, const Vec3<T>& wo) {
     const auto length = sqrt(dot(h, h));
     const auto cos_d = T(0.5) * length;
     const auto weight_d = schlick_weight<T>(cos_d);
-    const auto fresnel = CLEARCOAT_F0<T> + (T(1.0) - CLEARCOAT_F0<T>) * weight_d;
-    const auto masking_i = T(2.0) * i.z / masking_denominator<T>(i, CLEARCOAT_MASKING_ALPHA<T>,
-        CLEARCOAT_MASKING_ALPHA<T>);
-    const auto masking_o = T(2.0) * o.z / masking_denominator<T>(o, CLEARCOAT_MASKING_ALPHA<T>,
-        CLEARCOAT_MASKING_ALPHA<T>);
+    const auto fresnel = lerp(CLEARCOAT_F0<T>, T(1.0), weight_d);
+    const auto masking_i =
+        T(2.0) * i.z / masking_denominator<T>(i, CLEARCOAT_MASKING_ALPHA<T>, CLEARCOAT_MASKING_ALPHA<T>);
+    const auto masking_o =
+        T(2.0) * o.z / masking_denominator<T>(o, CLEARCOAT_MASKING_ALPHA<T>, CLEARCOAT_MASKING_ALPHA<T>);
     const auto clearcoat = T(0.25) * fresnel * masking_i * masking_o * o.z;
     const auto m = h * (T(1.0) / length);
-    return Geometry<T>{valid, i, o, m, cos_d, schlick_weight<T>(i.z), schlick_weight<T>(o.z), weight_d,
-        clearcoat};
+    return Geometry<T>{valid, i, o, m, cos_d, schlick_weight<T>(i.z), schlick_weight<T>(o.z), weight_d, clearcoat};
 }
 
 // Microfacet widths of the specular lobe along x and y. Burley 2012, section 5.4.
@@ -242,8 +241,7 @@ template <class T>
 inline Terms<T> diffuse_terms(const Principled<T>& p, const Geometry<T>& g) {
     const auto retro = T(2.0) * p.roughness * g.cos_d * g.cos_d;
     const auto lambert = (T(1.0) - T(0.5) * g.weight_i) * (T(1.0) - T(0.5) * g.weight_o);
-    const auto rough = lambert + retro * (g.weight_o + g.weight_i + g.weight_o * g.weight_i * (retro -
-        T(1.0)));
+    const auto rough = lambert + retro * (g.weight_o + g.weight_i + g.weight_o * g.weight_i * (retro - T(1.0)));
     const auto flat_90 = T(0.5) * retro - T(1.0);
     const auto flat_f = (T(1.0) + flat_90 * g.weight_o) * (T(1.0) + flat_90 * g.weight_i);
     const auto flat = T(1.25) * (flat_f * (T(1.0) / (g.wi.z + g.wo.z) - T(0.5)) + T(0.5));
@@ -260,8 +258,8 @@ inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     const auto tinted = (T(1.0) - p.metallic) * p.spec_tint;
     const auto plain = T(1.0) - p.metallic - tinted;
     const auto f0 = p.metallic + tinted * specular_f0<T>(p.specular) * luminance_inverse<T>(p.base_color);
-    const auto white = plain * dielectric_reflectance<T>(cos, cos2, specular_eta<T>(p.specular)) + (p.metallic
-        + tinted) * weight;
+    const auto white =
+        plain * dielectric_reflectance<T>(cos, cos2, specular_eta<T>(p.specular)) + (p.metallic + tinted) * weight;
     return Terms<T>{f0 * (T(1.0) - weight), white};
 }
 
@@ -276,8 +274,7 @@ inline T faded(const Principled<T>& p, T cos_h) {
 template <class T>
 inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
-    const auto spec_pdf = T(0.5) * ggx_d<T>(g.h, alpha_x, alpha_y) / masking_denominator<T>(g.wi, alpha_x,
-        alpha_y);
+    const auto spec_pdf = T(0.5) * ggx_d<T>(g.h, alpha_x, alpha_y) / masking_denominator<T>(g.wi, alpha_x, alpha_y);
     const auto spec = spec_pdf * (T(2.0) * g.wo.z / masking_denominator<T>(g.wo, alpha_x, alpha_y));
     const auto clearcoat_d = gtr1_d<T>(g.h, clearcoat_alpha<T>(p.clearcoat_gloss));
     const auto clearcoat_pdf = clearcoat_d * g.h.z / (T(4.0) * g.cos_d);
@@ -298,14 +295,11 @@ inline Vec3<T> diffuse_albedo(const Principled<T>& p, T cos, T weight) {
     const auto retro = r * (T(1.0) + T(2.0) / T(3.0) * cos);
     const auto retro_w = r * (W0<T> + cos * W1<T>);
     const auto sin2 = T(1.0) - cos * cos;
-    const auto retro2_w = r * r * (W0<T> + T(2.0) * cos * W1<T> + cos * cos * W2<T> + T(0.5) * sin2 * (W0<T> -
-        W2<T>));
+    const auto retro2_w = r * r * (W0<T> + T(2.0) * cos * W1<T> + cos * cos * W2<T> + T(0.5) * sin2 * (W0<T> - W2<T>));
     const auto base = lambert + retro_w + weight * (retro + retro2_w - retro_w);
     const auto x = T(1.0) - cos;
-    const auto sheen = x * x * (T(0.0904) + x * (-T(0.1469) + x * (T(0.2194) - T(0.0745) * x))) +
-        SHEEN_MARGIN<T>;
-    const auto tint = p.base_color * (p.sheen_tint * luminance_inverse<T>(p.base_color)) + (T(1.0) -
-        p.sheen_tint);
+    const auto sheen = x * x * (T(0.0904) + x * (-T(0.1469) + x * (T(0.2194) - T(0.0745) * x))) + SHEEN_MARGIN<T>;
+    const auto tint = p.base_color * (p.sheen_tint * luminance_inverse<T>(p.base_color)) + (T(1.0) - p.sheen_tint);
     return (p.base_color * base + tint * (p.sheen * sheen)) * (T(1.0) - p.metallic);
 }
 
@@ -328,7 +322,7 @@ inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
     const auto cos2 = cos * cos;
     const auto alpha2 = CLEARCOAT_MASKING_ALPHA<T> * CLEARCOAT_MASKING_ALPHA<T>;
     const auto masking = T(2.0) * cos / (cos + sqrt(cos2 + alpha2 * (T(1.0) - cos2)));
-    const auto fresnel = CLEARCOAT_F0<T> + (T(1.0) - CLEARCOAT_F0<T>) * weight;
+    const auto fresnel = lerp(CLEARCOAT_F0<T>, T(1.0), weight);
     return p.clearcoat * (fresnel * cos2 * masking * masking + CLEARCOAT_MARGIN<T>);
 }
 
@@ -336,8 +330,9 @@ inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
 template <class T>
 inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
     const auto weight = schlick_weight<T>(cos_theta_i);
-    return Albedos<T>{diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>, spec_albedo<T>(p,
-        cos_theta_i) + MIN_ALBEDO<T>, clearcoat_albedo<T>(p, cos_theta_i, weight)};
+    const auto diffuse = diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>;
+    const auto spec = spec_albedo<T>(p, cos_theta_i) + MIN_ALBEDO<T>;
+    return Albedos<T>{diffuse, spec, clearcoat_albedo<T>(p, cos_theta_i, weight)};
 }
 
 // A direction with density cos(theta) / pi.

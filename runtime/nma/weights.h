@@ -55,7 +55,8 @@ struct Weights {
     std::vector<Layer> layers;
     int instances = 0;
     bool directional = false, bounded = false;
-    // The parameters of the only material that the network was fitted to; empty where it knows its class, or where that has none.
+    // The parameters of the only material that the network was fitted to. Empty where it knows a class, or where the
+    // class has none.
     std::vector<float> material;
 };
 
@@ -72,7 +73,8 @@ constexpr double MOST_BYTES = 9e15;
 inline std::vector<std::uint64_t> whole(const Json& array, double limit) {
     std::vector<std::uint64_t> found;
     for (const Json& item : array.items) {
-        if (item.kind != Json::Kind::Number || !(item.number >= 0 && item.number <= limit) || item.number != std::floor(item.number))
+        if (item.kind != Json::Kind::Number || !(item.number >= 0 && item.number <= limit) ||
+            item.number != std::floor(item.number))
             throw Error("its header has a size that makes no sense");
         found.push_back(static_cast<std::uint64_t>(item.number));
     }
@@ -88,7 +90,8 @@ struct Place {
 
 inline Place place(const std::string& name, const Json& entry, std::size_t size) {
     if (entry.kind != Json::Kind::Object) throw Error("its header has no valid entry of tensor " + name);
-    if (entry.at("dtype", Json::Kind::String).string != "F32") throw Error("tensor " + name + " is not float32; convert or train it again");
+    if (entry.at("dtype", Json::Kind::String).string != "F32")
+        throw Error("tensor " + name + " is not float32; convert or train it again");
     const auto range = whole(entry.at("data_offsets", Json::Kind::Array), MOST_BYTES);
     Place made{name, whole(entry.at("shape", Json::Kind::Array), MOST_BYTES), 0, 0};
     std::uint64_t bytes = sizeof(float);
@@ -109,10 +112,12 @@ inline std::vector<Place> places(const Json& header, std::size_t size) {
     std::vector<Place> made;
     for (std::size_t k = 0; k < header.names.size(); ++k)
         if (header.names[k] != "__metadata__") made.push_back(place(header.names[k], header.items[k], size));
-    std::sort(made.begin(), made.end(), [](const Place& a, const Place& b) { return std::tie(a.first, a.last) < std::tie(b.first, b.last); });
+    std::sort(made.begin(), made.end(),
+              [](const Place& a, const Place& b) { return std::tie(a.first, a.last) < std::tie(b.first, b.last); });
     std::uint64_t end = 0;
     for (const Place& p : made) {
-        if (p.first != end) throw Error("tensor " + p.name + " does not begin where the one before it ends; copy or train it again");
+        if (p.first != end)
+            throw Error("tensor " + p.name + " does not begin where the one before it ends; copy or train it again");
         end = p.last;
     }
     if (end != size) throw Error("its tensors end before the file does; copy or train it again");
@@ -120,11 +125,13 @@ inline std::vector<Place> places(const Json& header, std::size_t size) {
 }
 
 // The numbers of a tensor of so many dimensions, all of them finite, and its `shape`.
-inline std::vector<float> tensor(const std::vector<Place>& places, const char* data, const std::string& name, std::size_t dimensions, std::vector<std::uint64_t>& shape) {
+inline std::vector<float> tensor(const std::vector<Place>& places, const char* data, const std::string& name,
+                                 std::size_t dimensions, std::vector<std::uint64_t>& shape) {
     const auto found = std::find_if(places.begin(), places.end(), [&](const Place& p) { return p.name == name; });
     if (found == places.end()) throw Error("it lacks tensor " + name + "; copy or train it again");
     shape = found->shape;
-    if (shape.size() != dimensions || *std::max_element(shape.begin(), shape.end()) > WIDEST) throw Error("tensor " + name + " has a shape that makes no sense");
+    if (shape.size() != dimensions || *std::max_element(shape.begin(), shape.end()) > WIDEST)
+        throw Error("tensor " + name + " has a shape that makes no sense");
     std::vector<float> values((found->last - found->first) / sizeof(float));
     if (!values.empty()) std::memcpy(values.data(), data + found->first, values.size() * sizeof(float));
     for (const float v : values)
@@ -140,7 +147,8 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
         Layer layer;
         layer.matrix = tensor(places, data, name + ".weight", 2, shape);
         layer.bias = tensor(places, data, name + ".bias", 1, length);
-        if (length[0] != shape[0] || !shape[0] || !shape[1] || (k && shape[1] != static_cast<std::uint64_t>(made.back().out)))
+        if (length[0] != shape[0] || !shape[0] || !shape[1] ||
+            (k && shape[1] != static_cast<std::uint64_t>(made.back().out)))
             throw Error("layer " + std::to_string(k) + " does not fit the one before it");
         layer.out = static_cast<int>(shape[0]);
         layer.in = static_cast<int>(shape[1]);
@@ -151,7 +159,8 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
 
 inline int small(const Json& entry, std::string_view name, int most) {
     const double n = entry.at(name, Json::Kind::Number).number;
-    if (!(n >= 1 && n <= most) || n != std::floor(n)) throw Error("its metadata has a senseless '" + std::string(name) + "'");
+    if (!(n >= 1 && n <= most) || n != std::floor(n))
+        throw Error("its metadata has a senseless '" + std::string(name) + "'");
     return static_cast<int>(n);
 }
 
@@ -160,7 +169,7 @@ inline bool flag(const Json& entry, std::string_view name) {
     return found && found->kind == Json::Kind::Boolean && found->boolean;
 }
 
-// The fields `low` and `high`. They are finite: JSON has no word for other numbers, and the reader refuses too large ones.
+// The fields `low` and `high`. They are finite: JSON has no word for other numbers, and the reader refuses large ones.
 inline std::pair<double, double> range(const Json& entry) {
     return {entry.at("low", Json::Kind::Number).number, entry.at("high", Json::Kind::Number).number};
 }
@@ -171,7 +180,8 @@ inline SourceParam source_param(const Json& entry) {
     p.size = small(entry, "size", 64);
     p.logarithmic = entry.at("law", Json::Kind::String).string == "log10";
     std::tie(p.low, p.high) = range(entry);
-    if (!(-FARTHEST <= p.low && p.low <= p.high && p.high <= FARTHEST) || (p.logarithmic && !(p.low > 0))) throw Error("parameter '" + p.name + "' has no valid range");
+    if (!(-FARTHEST <= p.low && p.low <= p.high && p.high <= FARTHEST) || (p.logarithmic && !(p.low > 0)))
+        throw Error("parameter '" + p.name + "' has no valid range");
     if (p.low < p.high) {
         p.start = static_cast<float>(p.logarithmic ? std::log(p.low) : p.low);
         p.per_range = static_cast<float>(1.0 / (p.logarithmic ? std::log(p.high / p.low) : p.high - p.low));
@@ -197,9 +207,12 @@ inline TargetParam target_param(const Json& entry) {
     p.logarithmic = scale == "log";
     p.in_plane = flag(entry, "in_plane");
     const auto [least, most] = limits(p.name);
-    if (!(least <= p.low && p.low < p.high && p.high <= most) || (p.logarithmic && !(p.low > 0))) throw Error("target parameter '" + p.name + "' has no valid range");
-    if (!p.logarithmic && scale != "linear") throw Error("target parameter '" + p.name + "' has the unknown scale '" + scale + "'");
-    if (p.in_plane && p.name != "anisotropic") throw Error("target parameter '" + p.name + "' has no plane of incidence");
+    if (!(least <= p.low && p.low < p.high && p.high <= most) || (p.logarithmic && !(p.low > 0)))
+        throw Error("target parameter '" + p.name + "' has no valid range");
+    if (!p.logarithmic && scale != "linear")
+        throw Error("target parameter '" + p.name + "' has the unknown scale '" + scale + "'");
+    if (p.in_plane && p.name != "anisotropic")
+        throw Error("target parameter '" + p.name + "' has no plane of incidence");
     return p;
 }
 
@@ -212,8 +225,10 @@ inline std::vector<float> material(const Json& about, const Weights& made) {
     if (!fitted || !size || (made.encoding != "direction" && made.encoding != "azimuth")) return {};
     std::vector<float> found;
     for (const Json& item : fitted->items)
-        if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30) found.push_back(static_cast<float>(item.number));
-    if (found.size() != size || fitted->items.size() != size) throw Error("its material is none of class " + made.class_name + "; fit it again");
+        if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30)
+            found.push_back(static_cast<float>(item.number));
+    if (found.size() != size || fitted->items.size() != size)
+        throw Error("its material is none of class " + made.class_name + "; fit it again");
     return found;
 }
 
@@ -225,37 +240,44 @@ inline Weights weights(const char* bytes, std::size_t size) {
     const Json header = Json::parse({bytes + 8, static_cast<std::size_t>(length)});
     const Json& metadata = header.at("__metadata__", Json::Kind::Object);
     const Json about = Json::parse(metadata.at("nma", Json::Kind::String).string);
-    if (about.at("format", Json::Kind::Number).number != FORMAT) throw Error("another format than this version reads; upgrade the runtime");
+    if (about.at("format", Json::Kind::Number).number != FORMAT)
+        throw Error("another format than this version reads; upgrade the runtime");
     Weights made;
     made.class_name = about.at("class_name", Json::Kind::String).string;
     made.encoding = about.at("encoding", Json::Kind::String).string;
     made.dialect = about.at("dialect", Json::Kind::String).string;
     made.directional = flag(about, "directional");
     made.bounded = flag(about, "bounded");
-    for (const Json& entry : about.at("parameters", Json::Kind::Array).items) made.parameters.push_back(source_param(entry));
+    for (const Json& entry : about.at("parameters", Json::Kind::Array).items)
+        made.parameters.push_back(source_param(entry));
     for (const Json& entry : about.at("target", Json::Kind::Array).items) made.target.push_back(target_param(entry));
     made.material = material(about, made);
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
     if (hidden.size() >= DEEPEST) throw Error("a network of too many layers");
     const char* data = bytes + 8 + length;
-    made.layers = layers(places(header, size - 8 - static_cast<std::size_t>(length)), data, static_cast<int>(hidden.size()) + 1);
+    made.layers =
+        layers(places(header, size - 8 - static_cast<std::size_t>(length)), data, static_cast<int>(hidden.size()) + 1);
     for (std::size_t k = 0; k < hidden.size(); ++k)
-        if (static_cast<std::uint64_t>(made.layers[k].out) != hidden[k]) throw Error("its hidden layers are not those of its metadata");
+        if (static_cast<std::uint64_t>(made.layers[k].out) != hidden[k])
+            throw Error("its hidden layers are not those of its metadata");
     return made;
 }
 
 }  // namespace detail
 
 // The contents of a weights file in memory. Throws `Error`.
-inline Weights parse_weights(const void* bytes, std::size_t size) { return detail::weights(static_cast<const char*>(bytes), size); }
+inline Weights parse_weights(const void* bytes, std::size_t size) {
+    return detail::weights(static_cast<const char*>(bytes), size);
+}
 
 // The bytes of a file. Throws `Error`.
 inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     std::string bytes;
     // Iterators would throw what is no `Error` where a folder, or a disk that fails, opens but cannot be read.
-    for (char block[1 << 14]; file.read(block, sizeof block), file.gcount() > 0;) bytes.append(block, static_cast<std::size_t>(file.gcount()));
+    for (char block[1 << 14]; file.read(block, sizeof block), file.gcount() > 0;)
+        bytes.append(block, static_cast<std::size_t>(file.gcount()));
     if (!file.eof()) throw Error("no such weights file, or it cannot be read");
     return bytes;
 }

@@ -11,7 +11,8 @@ namespace {
 
 constexpr int QUERIES = 1000;
 
-std::vector<float> outputs(const nma::Adapter& adapter, const std::vector<float>& parameters, const std::vector<nma::Direction>& wi, bool batch) {
+std::vector<float> outputs(const nma::Adapter& adapter, const std::vector<float>& parameters,
+                           const std::vector<nma::Direction>& wi, bool batch) {
     std::vector<float> found(static_cast<std::size_t>(QUERIES) * adapter.output_count());
     if (batch) adapter.network_outputs_many(QUERIES, parameters.data(), wi.data(), found.data());
     else
@@ -39,7 +40,8 @@ int main(int count, char** words) {
         const float z = uniform(engine), r = std::sqrt(1.0f - z * z), phi = 6.2831853f * uniform(engine);
         wi.push_back({r * std::cos(phi), r * std::sin(phi), z});
         for (const nma::SourceParam& p : portable.parameters())
-            for (int c = 0; c < p.size; ++c) parameters.push_back(static_cast<float>(p.low + (p.high - p.low) * uniform(engine)));
+            for (int c = 0; c < p.size; ++c)
+                parameters.push_back(static_cast<float>(p.low + (p.high - p.low) * uniform(engine)));
     }
     const std::vector<float> wanted = outputs(portable, parameters, wi, false);
     bool fine = true;
@@ -54,12 +56,13 @@ int main(int count, char** words) {
                 worst = std::max(worst, error);
                 squares += error * error;
             }
-            // bfloat16 keeps 8 bits of each activation; float32 sums in another order differ by roundings of their terms,
-            // which are larger than the outputs.
+            // bfloat16 keeps 8 bits of each activation; float32 sums in another order differ by roundings of their
+            // terms, which are larger than the outputs.
             const bool rounded = set == nma::InstructionSet::avx512_bf16;
             const double rms = std::sqrt(squares / static_cast<double>(wanted.size()));
             fine &= rounded ? rms < 0.02 : rms < 1e-6 && worst < 3e-5;
-            std::printf("%-11s %s  worst %.1e  rms %.1e, relative to 1 + |output|\n", nma::name(set), batch ? "batch" : "single", worst, rms);
+            std::printf("%-11s %s  worst %.1e  rms %.1e, relative to 1 + |output|\n", nma::name(set),
+                        batch ? "batch" : "single", worst, rms);
         }
     }
     return fine ? 0 : 1;

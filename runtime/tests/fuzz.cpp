@@ -1,6 +1,7 @@
 // Bytes that call themselves a weights file: whatever they are, loading ends in an adapter that works or in an error.
 //
-// Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER -Iruntime runtime/tests/fuzz.cpp -o fuzz
+// Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER -Iruntime \
+//                           runtime/tests/fuzz.cpp -o fuzz
 //                       ./fuzz -max_total_time=600 -max_len=4000 CORPUS
 // By chance alone:      c++ -std=c++17 -O1 -g -fsanitize=address,undefined -Iruntime runtime/tests/fuzz.cpp -o fuzz
 //                       ./fuzz COUNT WEIGHTS ...    changes bytes, words and lengths of these files, COUNT times each
@@ -54,17 +55,27 @@ namespace {
 
 // One to four changes of a file, most of them in its header.
 std::string changed(std::string bytes, std::mt19937& engine) {
-    static constexpr const char* WORDS[] = {"null", "-1", "1e308", "[", "}", "\"", "\\u0000", "0", "4096", "true", "layer0.weight", "99999999999999999999"};
+    static constexpr const char* WORDS[] = {
+        "null", "-1", "1e308", "[", "}", "\"", "\\u0000", "0", "4096", "true", "layer0.weight", "99999999999999999999"};
     const auto below = [&](std::size_t n) { return static_cast<std::size_t>(engine()) % std::max<std::size_t>(n, 1); };
     for (std::size_t k = 0, changes = 1 + below(4); k < changes && !bytes.empty(); ++k) {
         const std::size_t place = below(below(8) ? std::min<std::size_t>(bytes.size(), 4000) : bytes.size());
         const std::string word = WORDS[below(std::size(WORDS))];
         switch (below(5)) {
-            case 0: bytes[place] = static_cast<char>(engine()); break;
-            case 1: bytes[place] ^= static_cast<char>(1 << below(8)); break;
-            case 2: bytes.resize(place); break;
-            case 3: bytes.replace(place, std::min(word.size(), bytes.size() - place), word); break;
-            default: bytes.insert(place, word);
+            case 0:
+                bytes[place] = static_cast<char>(engine());
+                break;
+            case 1:
+                bytes[place] ^= static_cast<char>(1 << below(8));
+                break;
+            case 2:
+                bytes.resize(place);
+                break;
+            case 3:
+                bytes.replace(place, std::min(word.size(), bytes.size() - place), word);
+                break;
+            default:
+                bytes.insert(place, word);
         }
     }
     return bytes;

@@ -70,7 +70,8 @@ const char* round_of_calls(const nma::Adapter& adapter, Random& random) {
             if (!sound(s.value, s.pdf)) return "sample";
             if (s.pdf == 0.0f) continue;
             const nma::Value again = material.eval(wi, s.wo);
-            if (!close(again.pdf, s.pdf) || !close(again.value.x, s.value.x) || !close(again.value.y, s.value.y) || !close(again.value.z, s.value.z))
+            if (!close(again.pdf, s.pdf) || !close(again.value.x, s.value.x) || !close(again.value.y, s.value.y) ||
+                !close(again.value.z, s.value.z))
                 return "sample against eval";
         }
     }
@@ -98,6 +99,7 @@ int main(int count, char** words) {
                 }
         });
     for (std::thread& thread : running) thread.join();
-    std::printf("%ld calls on %s, %ld faults\n", rounds * CALLS_PER_ROUND * threads, nma::name(adapter.instruction_set()), faults.load());
+    std::printf("%ld calls on %s, %ld faults\n", rounds * CALLS_PER_ROUND * threads,
+                nma::name(adapter.instruction_set()), faults.load());
     return faults ? 1 : 0;
 }

@@ -26,10 +26,15 @@ NMA_OP Vec fma(Vec a, Vec b, Vec c) { return _mm256_fmadd_ps(a, b, c); }
 NMA_OP Vec max(Vec a, Vec b) { return _mm256_max_ps(a, b); }
 NMA_OP Vec min(Vec a, Vec b) { return _mm256_min_ps(a, b); }
 NMA_OP Vec nearest(Vec x) { return _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
-NMA_OP Vec scale(Vec a, Vec whole) { return mul(a, _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(whole), _mm256_set1_epi32(127)), 23))); }
+NMA_OP Vec scale(Vec a, Vec whole) {
+    return mul(a, _mm256_castsi256_ps(
+                      _mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(whole), _mm256_set1_epi32(127)), 23)));
+}
 NMA_OP __m256i raw(const std::uint32_t* pairs) { return _mm256_load_si256(reinterpret_cast<const __m256i*>(pairs)); }
 NMA_OP Vec even(const std::uint32_t* pairs) { return _mm256_castsi256_ps(_mm256_slli_epi32(raw(pairs), 16)); }
-NMA_OP Vec odd(const std::uint32_t* pairs) { return _mm256_castsi256_ps(_mm256_and_si256(raw(pairs), _mm256_set1_epi32(-65536))); }
+NMA_OP Vec odd(const std::uint32_t* pairs) {
+    return _mm256_castsi256_ps(_mm256_and_si256(raw(pairs), _mm256_set1_epi32(-65536)));
+}
 
 using Few = Indexed;
 

@@ -36,8 +36,12 @@ NMA_OP Vec min(Vec a, Vec b) { return _mm512_maskz_min_ps(ALL, a, b); }
 NMA_OP Vec nearest(Vec x) { return _mm512_maskz_roundscale_ps(ALL, x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 NMA_OP Vec scale(Vec a, Vec whole) { return _mm512_maskz_scalef_ps(ALL, a, whole); }
 NMA_OP __m512i raw(const std::uint32_t* pairs) { return _mm512_load_si512(pairs); }
-NMA_OP Vec even(const std::uint32_t* pairs) { return _mm512_castsi512_ps(_mm512_maskz_slli_epi32(ALL, raw(pairs), 16)); }
-NMA_OP Vec odd(const std::uint32_t* pairs) { return _mm512_castsi512_ps(_mm512_and_si512(raw(pairs), _mm512_set1_epi32(-65536))); }
+NMA_OP Vec even(const std::uint32_t* pairs) {
+    return _mm512_castsi512_ps(_mm512_maskz_slli_epi32(ALL, raw(pairs), 16));
+}
+NMA_OP Vec odd(const std::uint32_t* pairs) {
+    return _mm512_castsi512_ps(_mm512_and_si512(raw(pairs), _mm512_set1_epi32(-65536)));
+}
 
 // At most 32 numbers, out of registers.
 struct Few {
@@ -60,16 +64,22 @@ struct Few {
 // A column's four numbers from `p` on, or from block B of a vector on, in all blocks of four lanes.
 NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_loadu_ps(p)); }
 template <int B>
-NMA_OP Vec repeat(Vec v) { return _mm512_maskz_shuffle_f32x4(ALL, v, v, B * 0x55); }
+NMA_OP Vec repeat(Vec v) {
+    return _mm512_maskz_shuffle_f32x4(ALL, v, v, B * 0x55);
+}
 // Lane k of each block of four becomes lane (k + R) % 4.
 template <int R>
-NMA_OP Vec turn(Vec v) { return _mm512_maskz_permute_ps(ALL, v, R == 1 ? 0x93 : 0x4e); }
+NMA_OP Vec turn(Vec v) {
+    return _mm512_maskz_permute_ps(ALL, v, R == 1 ? 0x93 : 0x4e);
+}
 
 // Adds what four inputs, in all blocks, contribute by four columns to the sums that are still to be turned.
 NMA_OP void add_block(Vec (&sums)[4], Vec inputs, const float* columns) {
     NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * LANES), sums[r]);
 }
-NMA_OP Vec turned(const Vec (&sums)[4]) { return add(add(sums[0], turn<1>(sums[1])), turn<2>(add(sums[2], turn<1>(sums[3])))); }
+NMA_OP Vec turned(const Vec (&sums)[4]) {
+    return add(add(sums[0], turn<1>(sums[1])), turn<2>(add(sums[2], turn<1>(sums[3]))));
+}
 
 // A layer of two vectors for inputs in memory, and for the two vectors of the layer before it.
 NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
@@ -82,7 +92,8 @@ NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
 }
 NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     const Vec a = max(y[0], set(0.0f)), b = max(y[1], set(0.0f));
-    const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a), repeat<0>(b), repeat<1>(b), repeat<2>(b), repeat<3>(b)};
+    const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a),
+                          repeat<0>(b), repeat<1>(b), repeat<2>(b), repeat<3>(b)};
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
         Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
         NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.turned + (v * 8 + k) * 4 * LANES);
@@ -103,7 +114,8 @@ NMA_FN inline void forward_narrow(const NetworkView& view, const float* inputs, 
     store(outputs + LANES, y[1]);
 }
 
-NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, Blend<float>& blend) {
+NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* parameters, const Vec3<float>& wi,
+                                            Blend<float>& blend) {
     alignas(64) float inputs[WIDEST_LAYER], numbers[NARROW];
     Vec y[2];
     encode(recipe, parameters, wi, inputs);
@@ -116,7 +128,8 @@ NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* p
     weigh(blend, wi.z, recipe.bounded);
 }
 
-NMA_FN inline void prepare_either(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, Blend<float>& blend) {
+NMA_FN inline void prepare_either(const Recipe& recipe, const float* parameters, const Vec3<float>& wi,
+                                  Blend<float>& blend) {
     if (recipe.network.narrow) return prepare_narrow(recipe, parameters, wi, blend);
     prepare<forward>(recipe, parameters, wi, blend);
 }

@@ -1,5 +1,5 @@
-// x86-64 with AVX512-BF16, whose dot product takes two inputs at once: activations are rounded to bfloat16 (8 bits), sums
-// are float32. Layers must have `pairs`.
+// x86-64 with AVX512-BF16, whose dot product takes two inputs at once: activations are rounded to bfloat16 (8 bits),
+// sums are float32. Layers must have `pairs`.
 #pragma once
 
 #include <cstring>
@@ -14,9 +14,10 @@ namespace nma::avx512_bf16 {
 using avx512::LANES;
 using avx512::Vec;
 
-// `VECTORS` vectors of neurons from `first` on, for QUERIES queries whose inputs lie in pairs. Twin of tile in body.inl.
+// VECTORS vectors of neurons from `first` on, for QUERIES queries whose inputs lie in pairs. Twin of tile in body.inl.
 template <int VECTORS, int QUERIES, int SUMS>
-NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y, int y_stride) {
+NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y,
+                        int y_stride) {
     Vec sums[SUMS][QUERIES][VECTORS];
     NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
         sums[0][q][v] = _mm512_load_ps(layer.bias + first + v * LANES);
@@ -29,8 +30,10 @@ NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* 
             NMA_UNROLL for (int v = 0; v < VECTORS; ++v) weights[v] = _mm512_load_si512(pair + v * LANES);
             NMA_UNROLL for (int q = 0; q < QUERIES; ++q) {
                 const __m512i input = _mm512_set1_epi32(static_cast<int>(x[q * x_stride + i + k]));
-                NMA_UNROLL for (int v = 0; v < VECTORS; ++v)
-                    sums[k % SUMS][q][v] = _mm512_dpbf16_ps(sums[k % SUMS][q][v], (__m512bh)input, (__m512bh)weights[v]);
+                NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
+                    Vec& sum = sums[k % SUMS][q][v];
+                    sum = _mm512_dpbf16_ps(sum, (__m512bh)input, (__m512bh)weights[v]);
+                }
             }
             pair += layer.width;
         }
@@ -43,18 +46,23 @@ NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* 
 }
 
 template <int VECTORS, int QUERIES>
-NMA_FN inline void tiles(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y, int y_stride) {
+NMA_FN inline void tiles(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y,
+                         int y_stride) {
     constexpr int SUMS = QUERIES > 1 ? 1 : 2;
-    for (; first + VECTORS * LANES <= layer.width; first += VECTORS * LANES) tile<VECTORS, QUERIES, SUMS>(layer, first, x, x_stride, y, y_stride);
+    for (; first + VECTORS * LANES <= layer.width; first += VECTORS * LANES)
+        tile<VECTORS, QUERIES, SUMS>(layer, first, x, x_stride, y, y_stride);
     if constexpr (VECTORS > 1)
         if (first < layer.width) tiles<VECTORS / 2, QUERIES>(layer, first, x, x_stride, y, y_stride);
 }
 
 // Sixteen floats as bfloat16 in eight pairs, rounded to nearest.
-NMA_OP void store_pairs(std::uint32_t* pairs, Vec v) { _mm256_store_si256(reinterpret_cast<__m256i*>(pairs), (__m256i)_mm512_cvtneps_pbh(v)); }
+NMA_OP void store_pairs(std::uint32_t* pairs, Vec v) {
+    _mm256_store_si256(reinterpret_cast<__m256i*>(pairs), (__m256i)_mm512_cvtneps_pbh(v));
+}
 
 template <int QUERIES>
-NMA_FN inline void network(const NetworkView& view, const float* inputs, int input_stride, float* outputs, int output_stride) {
+NMA_FN inline void network(const NetworkView& view, const float* inputs, int input_stride, float* outputs,
+                           int output_stride) {
     alignas(64) float y[QUERIES * WIDEST_LAYER];
     alignas(64) std::uint32_t x[QUERIES * WIDEST_LAYER / 2];
     constexpr int STRIDE = WIDEST_LAYER / 2;
@@ -70,15 +78,20 @@ NMA_FN inline void network(const NetworkView& view, const float* inputs, int inp
         tiles<4, QUERIES>(layer, 0, x, STRIDE, y, layer.width);
         for (int q = 0; q < QUERIES; ++q)
             for (int j = 0; j < layer.width; j += LANES)
-                store_pairs(x + q * STRIDE + j / 2, _mm512_maskz_max_ps(avx512::ALL, _mm512_load_ps(y + q * layer.width + j), _mm512_setzero_ps()));
+                store_pairs(x + q * STRIDE + j / 2,
+                            avx512::max(avx512::load(y + q * layer.width + j), avx512::set(0.0f)));
     }
 }
 
-NMA_FN inline void forward(const NetworkView& view, const float* inputs, float* outputs) { network<1>(view, inputs, 0, outputs, 0); }
+NMA_FN inline void forward(const NetworkView& view, const float* inputs, float* outputs) {
+    network<1>(view, inputs, 0, outputs, 0);
+}
 
-NMA_FN inline void forward_many(const NetworkView& view, int queries, const float* inputs, int input_stride, float* outputs, int output_stride) {
+NMA_FN inline void forward_many(const NetworkView& view, int queries, const float* inputs, int input_stride,
+                                float* outputs, int output_stride) {
     int q = 0;
-    for (; q + 6 <= queries; q += 6) network<6>(view, inputs + q * input_stride, input_stride, outputs + q * output_stride, output_stride);
+    for (; q + 6 <= queries; q += 6)
+        network<6>(view, inputs + q * input_stride, input_stride, outputs + q * output_stride, output_stride);
     for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
 }
 

@@ -20,9 +20,9 @@ constexpr int MOST_TOGETHER = 8;
 // where each number holds the weights of inputs 2 i (low half) and 2 i + 1 (high half) as bfloat16: half the memory,
 // which is what a single query waits for.
 //
-// Narrow networks have `turned` too, for single queries on AVX-512: it takes four inputs at once as they lie, again and again:
-// column 4 b + r holds, at neuron 4 g + k, what input 4 b + k adds to neuron 4 g + (k + r) % 4. The sum over all b is turned
-// by r once, at its end. All columns of the first WIDTH_STEP neurons come first, then those of the next.
+// Narrow networks have `turned` too, for single queries on AVX-512: it takes four inputs at once as they lie, again and
+// again: column 4 b + r holds, at neuron 4 g + k, what input 4 b + k adds to neuron 4 g + (k + r) % 4. The sum over all
+// b is turned by r once, at its end. All columns of the first WIDTH_STEP neurons come first, then those of the next.
 struct LayerView {
     int in, width;  // padded with zeros
     const float* bias;
@@ -36,9 +36,9 @@ struct NetworkView {
     LayerView layers[DEEPEST_NETWORK];
 };
 
-// Numbers that a network's outputs become, of their sigmoids u: start + slope u + factor 2^(rate u), and those `in_plane`
-// times the fade towards normal incidence. All padded with zeros to `count`, a multiple of WIDTH_STEP that leaves room for
-// at least one of them; from `logarithmic` on all factors are 0.
+// Numbers that a network's outputs become, of their sigmoids u: start + slope u + factor 2^(rate u), and those
+// `in_plane` times the fade towards normal incidence. All padded with zeros to `count`, a multiple of WIDTH_STEP that
+// leaves room for at least one of them; from `logarithmic` on all factors are 0.
 struct Ranges {
     int count, logarithmic;
     const float *start, *slope, *factor, *rate, *in_plane;  // `in_plane` holds 1 or 0

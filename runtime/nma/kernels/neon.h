@@ -26,9 +26,13 @@ NMA_OP Vec fma(Vec a, Vec b, Vec c) { return vfmaq_f32(c, a, b); }
 NMA_OP Vec max(Vec a, Vec b) { return vmaxq_f32(a, b); }
 NMA_OP Vec min(Vec a, Vec b) { return vminq_f32(a, b); }
 NMA_OP Vec nearest(Vec x) { return vrndnq_f32(x); }
-NMA_OP Vec scale(Vec a, Vec whole) { return mul(a, vreinterpretq_f32_s32(vshlq_n_s32(vaddq_s32(vcvtq_s32_f32(whole), vdupq_n_s32(127)), 23))); }
+NMA_OP Vec scale(Vec a, Vec whole) {
+    return mul(a, vreinterpretq_f32_s32(vshlq_n_s32(vaddq_s32(vcvtq_s32_f32(whole), vdupq_n_s32(127)), 23)));
+}
 NMA_OP Vec even(const std::uint32_t* pairs) { return vreinterpretq_f32_u32(vshlq_n_u32(vld1q_u32(pairs), 16)); }
-NMA_OP Vec odd(const std::uint32_t* pairs) { return vreinterpretq_f32_u32(vandq_u32(vld1q_u32(pairs), vdupq_n_u32(0xffff0000u))); }
+NMA_OP Vec odd(const std::uint32_t* pairs) {
+    return vreinterpretq_f32_u32(vandq_u32(vld1q_u32(pairs), vdupq_n_u32(0xffff0000u)));
+}
 
 using Few = Indexed;
 

@@ -43,25 +43,50 @@ NMA_OP Vec load(const float* p) {
     return v;
 }
 NMA_OP void store(float* p, Vec v) { std::memcpy(p, &v, sizeof(v)); }
-NMA_OP Vec set(float x) { return each([&](int) { return x; }); }
+NMA_OP Vec set(float x) {
+    return each([&](int) { return x; });
+}
 #if defined(__GNUC__)
 NMA_OP Vec add(Vec a, Vec b) { return a + b; }
 NMA_OP Vec sub(Vec a, Vec b) { return a - b; }
 NMA_OP Vec mul(Vec a, Vec b) { return a * b; }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return a * b + c; }
 #else
-NMA_OP Vec add(Vec a, Vec b) { return each([&](int k) { return a[k] + b[k]; }); }
-NMA_OP Vec sub(Vec a, Vec b) { return each([&](int k) { return a[k] - b[k]; }); }
-NMA_OP Vec mul(Vec a, Vec b) { return each([&](int k) { return a[k] * b[k]; }); }
-NMA_OP Vec fma(Vec a, Vec b, Vec c) { return each([&](int k) { return a[k] * b[k] + c[k]; }); }
+NMA_OP Vec add(Vec a, Vec b) {
+    return each([&](int k) { return a[k] + b[k]; });
+}
+NMA_OP Vec sub(Vec a, Vec b) {
+    return each([&](int k) { return a[k] - b[k]; });
+}
+NMA_OP Vec mul(Vec a, Vec b) {
+    return each([&](int k) { return a[k] * b[k]; });
+}
+NMA_OP Vec fma(Vec a, Vec b, Vec c) {
+    return each([&](int k) { return a[k] * b[k] + c[k]; });
+}
 #endif
-NMA_OP Vec max(Vec a, Vec b) { return each([&](int k) { return a[k] > b[k] ? a[k] : b[k]; }); }
-NMA_OP Vec min(Vec a, Vec b) { return each([&](int k) { return a[k] < b[k] ? a[k] : b[k]; }); }
-NMA_OP Vec nearest(Vec x) { return each([&](int k) { return static_cast<float>(static_cast<int>(x[k] + (x[k] < 0.0f ? -0.5f : 0.5f))); }); }
-NMA_OP Vec inverse(Vec a) { return each([&](int k) { return 1.0f / a[k]; }); }
-NMA_OP Vec scale(Vec a, Vec whole) { return mul(a, each([&](int k) { return from_bits(static_cast<std::uint32_t>(static_cast<int>(whole[k]) + 127) << 23); })); }
-NMA_OP Vec even(const std::uint32_t* pairs) { return each([&](int k) { return from_bits(pairs[k] << 16); }); }
-NMA_OP Vec odd(const std::uint32_t* pairs) { return each([&](int k) { return from_bits(pairs[k] & 0xffff0000u); }); }
+NMA_OP Vec max(Vec a, Vec b) {
+    return each([&](int k) { return a[k] > b[k] ? a[k] : b[k]; });
+}
+NMA_OP Vec min(Vec a, Vec b) {
+    return each([&](int k) { return a[k] < b[k] ? a[k] : b[k]; });
+}
+NMA_OP Vec nearest(Vec x) {
+    return each([&](int k) { return static_cast<float>(static_cast<int>(x[k] + (x[k] < 0.0f ? -0.5f : 0.5f))); });
+}
+NMA_OP Vec inverse(Vec a) {
+    return each([&](int k) { return 1.0f / a[k]; });
+}
+NMA_OP Vec scale(Vec a, Vec whole) {
+    return mul(
+        a, each([&](int k) { return from_bits(static_cast<std::uint32_t>(static_cast<int>(whole[k]) + 127) << 23); }));
+}
+NMA_OP Vec even(const std::uint32_t* pairs) {
+    return each([&](int k) { return from_bits(pairs[k] << 16); });
+}
+NMA_OP Vec odd(const std::uint32_t* pairs) {
+    return each([&](int k) { return from_bits(pairs[k] & 0xffff0000u); });
+}
 
 using Few = Indexed;
 
