@@ -32,7 +32,7 @@ from matplotlib.figure import Figure
 
 from nma import materials
 from nma.adapter import shipped
-from nma.image_metrics import errors
+from nma.images.metrics import errors
 from nma.render.load import load_dict
 from nma.render.progressive import render_passes
 from nma.render.scene import material_coverage

@@ -23,9 +23,10 @@ import numpy as np
 from machine import header
 
 import nma
-from nma import native, network
+from nma import network
 from nma.adapter import weights_file
 from nma.llvm import ensure_llvm
+from nma.native import build
 
 HERE = Path(__file__).parent
 EIGEN = "/usr/include/eigen3"
@@ -64,9 +65,9 @@ def cpp() -> list[dict]:
     """Compiles and runs bench/runtime.cpp for the machine at hand; kernels choose their instructions themselves."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "runtime"
-        flags = ["-std=c++17", "-O2", "-march=native", f"-I{native.sources()}"]
+        flags = ["-std=c++17", "-O2", "-march=native", f"-I{build.sources()}"]
         flags += [f"-isystem{EIGEN}"] if Path(EIGEN).exists() else []
-        subprocess.run([native.compiler(), *flags, str(HERE / "runtime.cpp"), "-o", str(program)], check=True)
+        subprocess.run([build.compiler(), *flags, str(HERE / "runtime.cpp"), "-o", str(program)], check=True)
         words = [f"{name.split('-')[1]}={weights_file(name)}" for name in nma.shipped()]
         run = subprocess.run([program, *words], capture_output=True, text=True, check=True)
     return [json.loads(line) for line in run.stdout.splitlines()]

@@ -24,8 +24,8 @@ import numpy as np
 import scenes
 from numpy.typing import NDArray
 
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import errors
+from nma.images.metrics import errors
+from nma.images.sheet import Row, contact_sheet
 from nma.render.load import DEFAULT_ADAPTER
 
 ENLARGED = 4

@@ -17,9 +17,9 @@ import numpy as np
 from machine import header
 
 import nma
-from nma.dataset import Settings, simulate_block
+from nma.table.dataset import Settings, simulate_block
 from nma.train import loop
-from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.batches import Batch, BinSampler, Pool, draw
 from nma.train.loss import network_outputs
 from nma.train.recipe import Recipe, preset
 from nma.train.run import initial_layers

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nma
-from nma.metrics import table_metrics
+from nma.evaluate.metrics import table_metrics
 
 ROOT = Path(__file__).parent.parent
 REFERENCES = ROOT / "out/references"

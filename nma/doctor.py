@@ -10,9 +10,10 @@ import tempfile
 from dataclasses import dataclass
 from importlib import metadata
 
-from nma import llvm, native
+from nma import llvm
 from nma.errors import MissingDependencyError
 from nma.llvm import ensure_llvm
+from nma.native import build
 
 __all__ = ["Finding", "check", "ensure_llvm"]
 
@@ -151,7 +152,7 @@ def _requirement(distribution: str) -> str:
 def _compiler() -> Finding:
     purpose = "for plugins of scalar_rgb and the C++ runtime in Python"
     try:
-        return Finding("C++ compiler", True, native.compiler(), optional=True)
+        return Finding("C++ compiler", True, build.compiler(), optional=True)
     except MissingDependencyError:
         return Finding("C++ compiler", False, f"{purpose}; there is none", _advice("compiler"), True)
 

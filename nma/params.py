@@ -234,7 +234,7 @@ LAYERED3 = ParamSpace(
 # A single material, of which nothing is known but its values: measured, tabulated, or somebody else's BSDF.
 MEASURED = ParamSpace("measured", ())
 
-# A material of a library (`nma.library`) by its learned code, whose numbers mean nothing one by one.
+# A material of a library (`nma.adapter.library`) by its learned code, whose numbers mean nothing one by one.
 CODE_BOUND = 4.0
 LIBRARY = ParamSpace(
     "library",

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nma import encoding, network, target
-from nma.adapter import Adapter
+from nma import network, target
+from nma.adapter import Adapter, encoding
 from nma.params import LAYERED3, MEASURED
 from nma.target import ANISOTROPIC_PARAMS, PRINCIPLED_PARAMS
 

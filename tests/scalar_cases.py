@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from nma import native
+from nma.native import build
 
 MATERIAL = {
     "alpha_top": 0.08,
@@ -52,7 +52,7 @@ def plugins() -> Path:
     """The folder of the compiled plugins; `conftest.py` says which cache it lies in."""
     if shutil.which("c++") is None:
         pytest.skip("there is no C++ compiler here")
-    return native.build_mitsuba()
+    return build.build_mitsuba()
 
 
 def run(program: str, variant: str, *words) -> subprocess.CompletedProcess:

@@ -6,8 +6,8 @@ import pytest
 
 import nma.render
 from nma.errors import ParamError, one_line
-from nma.image_io import read_image
-from nma.image_size import MOST_PIXELS
+from nma.images.io import read_image
+from nma.images.size import MOST_PIXELS
 from nma.render.load import load_scene
 from nma.render.progressive import render_passes
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import typer
 
-from nma import cli, encoding, network
-from nma.adapter import Adapter
+from nma import cli, network
+from nma.adapter import Adapter, encoding
 from nma.cli.learn import _finite
-from nma.image_io import read_image, write_exr
-from nma.metrics import FIGURES
+from nma.evaluate.metrics import FIGURES
+from nma.images.io import read_image, write_exr
 from nma.params import LAYERED3
 from nma.target import PRINCIPLED_PARAMS
 from nma.target.decode import output_size

@@ -12,7 +12,7 @@ from typer.models import ArgumentInfo
 
 import nma.render.demo  # noqa: F401  # what tests replace in it must be there before
 from nma import table
-from nma.image_io import write_exr
+from nma.images.io import write_exr
 from nma.table import Tables
 
 WRITING = [words for words, function in commands() if "output" in {name for name, *_ in parameters(function)}]
@@ -107,7 +107,7 @@ def test_errors_of_the_system_elsewhere_are_one_line(nma, monkeypatch):
     def no_folder():
         raise PermissionError(errno.EACCES, "Permission denied", "/locked/cache")
 
-    monkeypatch.setattr("nma.native.build_mitsuba", lambda say: no_folder())
+    monkeypatch.setattr("nma.native.build.build_mitsuba", lambda say: no_folder())
     assert nma("mitsuba", "build") == (1, "", "nma: /locked/cache: Permission denied\n")
 
 

@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from nma import progress
-from nma.cli import console, data
-from nma.metrics import FIGURES
+from nma.cli import console, simulate
+from nma.evaluate.metrics import FIGURES
 from nma.train import fit
 from nma.train.recipe import SINGLE
 
@@ -122,7 +122,7 @@ def test_a_dataset_says_how_long_it_will_take(nma, tmp_path):
     code, _, err = nma("dataset", "layered3", tmp_path / "x.zarr", "--materials", 2, "--walks", 1600)
     assert code == 0
     assert "to go at" in err and "million walks per second" in err
-    assert [data._span(s) for s in (5, 300, 9000, 1e6)] == [
+    assert [simulate._span(s) for s in (5, 300, 9000, 1e6)] == [
         "5 seconds",
         "5.0 minutes",
         "2.5 hours",

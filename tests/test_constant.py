@@ -18,7 +18,7 @@ from nma.params import LAYERED3
 from nma.sources.mitsuba_bsdf import from_dict, from_string
 from nma.sources.nbrdf import WEIGHTS
 from nma.table import Tables, stream_keys, tabulate
-from nma.tabulation import tabulate_values
+from nma.table.values import tabulate_values
 from nma.target import Principled, eval_principled
 from nma.train.constant import CONSTANT, Constant, fit_constant
 
@@ -218,7 +218,7 @@ def test_the_command_writes_what_mitsuba_loads(nma, fit, fitted, red, tmp_path):
 
 @pytest.mark.slow
 def test_named_materials_values_and_tables_are_sources(nma, fitted, red, monkeypatch, tmp_path):
-    monkeypatch.setattr("nma.tabulation.POINTS", 16)
+    monkeypatch.setattr("nma.table.values.POINTS", 16)
     xml, both, networks = tmp_path / "red.xml", tmp_path / "both.npz", tmp_path / "networks.npz"
     xml.write_text(principled_xml(RED))
     np.savez(networks, names=np.array(["a", "b"]), weights=np.zeros((2, WEIGHTS), np.float32))

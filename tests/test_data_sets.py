@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nma.errors import SourceError
-from nma.sources import datasets, merl
-from nma.sources.datasets import DATASETS
+from nma.sources import catalogue, merl
+from nma.sources.catalogue import DATASETS
 from nma.sources.merl import Merl
 
 
@@ -105,7 +105,7 @@ def test_what_is_no_data_set_is_said_to_be_none(data, tmp_path):
     assert "no file of a known data set (.binary, .bsdf, .npz)" in out
     for path, message in ((tmp_path, "holds no file of a known data set"), (tmp_path / "no", "no such file")):
         with pytest.raises(SourceError, match=message):
-            list(datasets.check(path))
+            list(catalogue.check(path))
         code, out, err = data("check", path)
         assert (code, out) == (1, "")
         assert err.startswith("nma: ") and err.count("\n") == 1 and str(path) in err

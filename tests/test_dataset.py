@@ -12,18 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nma import dataset
-from nma.dataset import Dataset, Settings, draw_params, simulate_block
 from nma.errors import DatasetError
-from nma.table import ISOTROPIC
+from nma.table import ISOTROPIC, dataset
+from nma.table.dataset import Dataset, Settings, draw_params, simulate_block
 
 SETTINGS = Settings("layered3", 24, 40_000, 7)
 
 # Writes the dataset of argv[1] in blocks of argv[2]; once argv[3] materials are done, it dies argv[4] seconds later.
 WORKER = """
 import os, signal, sys, threading
-from nma import dataset
-from nma.dataset import Dataset, Settings
+from nma.table import dataset
+from nma.table.dataset import Dataset, Settings
 
 path, block, fatal, delay = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
 timer = threading.Timer(delay, lambda: os.kill(os.getpid(), signal.SIGKILL))

@@ -4,7 +4,7 @@ import pytest
 from adapter_cases import random_adapter
 
 import nma.render
-from nma.image_io import read_image
+from nma.images.io import read_image
 from nma.render import demo
 from nma.render.demo import Settings, total_samples
 

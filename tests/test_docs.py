@@ -13,7 +13,7 @@ import pytest
 from adapter_cases import random_adapter
 
 from nma.adapter import Adapter
-from nma.library import Library
+from nma.adapter.library import Library
 from nma.params import LIBRARY
 from nma.train import recipe as recipes
 

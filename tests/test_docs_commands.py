@@ -12,7 +12,7 @@ import typer
 from target_cases import FAST_COMPILE
 
 from nma import cli
-from nma.image_io import write_exr
+from nma.images.io import write_exr
 from nma.params import LAYERED3
 from nma.sources.merl import SHAPE, Merl
 from nma.train import loop

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from nma import ava, evaluate, metrics, target
+from nma import evaluate, target
 from nma.adapter import Adapter
 from nma.errors import ParamError, TableError
-from nma.evaluate import tabulate_adapter
+from nma.evaluate import metrics, tabulate_adapter
+from nma.evaluate.metrics import counting_error, noise_floor, table_metrics
 from nma.jit import dr
-from nma.metrics import counting_error, noise_floor, table_metrics
 from nma.ops import Color, Vec3
 from nma.params import LAYERED3
-from nma.table import ISOTROPIC, Tables
+from nma.table import ISOTROPIC, Tables, quadrature
 from nma.target import PRINCIPLED_PARAMS, Blend, Principled
 
 FALSE_ALARM = 1e-3
@@ -65,9 +65,9 @@ def fine_means(adapter, bins, points=1 << 11, repeats=6):
     means = []
     for repeat in range(repeats):
         shift = np.random.default_rng(repeat).random((3, 1, len(bins)))
-        u = (ava.lattice(points).T[:, :, None] + shift) % 1.0
+        u = (quadrature.lattice(points).T[:, :, None] + shift) % 1.0
         i, o, p = (Float(np.broadcast_to(x, u[0].shape).ravel().astype(np.float32)) for x in bins.T)
-        found = ava.bin_points(i, o, p, tuple(Float(x.ravel().astype(np.float32)) for x in u))
+        found = quadrature.bin_points(i, o, p, tuple(Float(x.ravel().astype(np.float32)) for x in u))
         blend = adapter.prepare([Float(0.5)] * 13, found.wi.z)
         value = target.eval(blend, found.wi, found.wo) * found.weight
         dr.eval(value)

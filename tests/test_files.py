@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nma import image_io
 from nma.errors import NmaError, OutputError
 from nma.files import try_file, try_folder, whole, write_bytes
+from nma.images import io
 from nma.sources import nbrdf
 from nma.sources.merl import SHAPE, Merl
 from nma.table import Tables
@@ -84,8 +84,8 @@ def _full(*args, **kwargs):
 WRITERS = {
     "tables": lambda path: Tables(np.zeros((1, 0)), np.zeros((1, 2, 2, 2, 3)), np.ones(1, int)).save(path),
     "merl": lambda path: Merl(np.ones((3, *SHAPE))).save(path),
-    "png": lambda path: image_io.write_png(path, IMAGE),
-    "exr": lambda path: image_io.write_exr(path, IMAGE),
+    "png": lambda path: io.write_png(path, IMAGE),
+    "exr": lambda path: io.write_exr(path, IMAGE),
     "plot": lambda path: plot_losses([1.0, 2.0, 3.0], path, "losses"),
 }
 

@@ -9,15 +9,15 @@ import pytest
 pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_type=ImportError)
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
 
-from nma import collection, network
+from nma import network
 from nma.adapter import Adapter
+from nma.adapter.library import Library
 from nma.errors import NmaError, ParamError, SourceError, TableError, WeightsError
 from nma.evaluate import evaluate
-from nma.library import Library
+from nma.native.runtime import Runtime
 from nma.params import LAYERED3, LIBRARY
-from nma.runtime import Runtime
 from nma.sources.merl import SHAPE, Merl
-from nma.table import ISOTROPIC, Tables
+from nma.table import ISOTROPIC, Tables, collection
 from nma.target import PRINCIPLED_PARAMS
 from nma.train import library as training
 from nma.train import loop

@@ -32,7 +32,7 @@ from nma.evaluate import tabulate_adapter
 from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 from nma.target.decode import logit
-from nma.train.data import Batch
+from nma.train.batches import Batch
 from nma.train.loss import albedos, blend_of, loss
 
 

@@ -12,10 +12,10 @@ from source_cases import LAMBERT, Formula, direction, lanes, numbers, pairs
 
 from nma import materials, ops
 from nma.adapter import Adapter
+from nma.adapter.values import AdapterValues
 from nma.errors import SourceError
 from nma.ops import Vec3
 from nma.sources import half_difference, merl, read
-from nma.sources.adapter import AdapterValues
 from nma.sources.merl import BYTES, SCALE, SHAPE, Merl
 from nma.sources.nbrdf import WEIGHTS
 from nma.table import Tables

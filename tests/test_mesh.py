@@ -5,7 +5,7 @@ import pytest
 from adapter_cases import random_anisotropic_adapter
 
 import nma.render
-from nma.image_io import read_image
+from nma.images.io import read_image
 from nma.render.load import load_dict
 from nma.render.mesh import HEIGHT, LIFT, WIDTH, MeshError, mesh_shape
 from nma.render.scene import bitmap_texture, preview_scene

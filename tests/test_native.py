@@ -5,8 +5,10 @@ import pytest
 from scalar_cases import plugins
 
 import nma
-from nma import encoding, native, network
+from nma import network
+from nma.adapter import encoding
 from nma.errors import MissingDependencyError
+from nma.native import build
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +19,7 @@ def cache():
 @pytest.mark.slow
 def test_what_is_built_is_not_built_again(cache):
     said = []
-    assert native.build_mitsuba(said.append) == cache
+    assert build.build_mitsuba(said.append) == cache
     assert "up to date" in said[0]
     assert {path.stem for path in (cache / "adapters").glob("*.safetensors")} == set(nma.shipped())
 
@@ -26,7 +28,7 @@ def test_without_a_compiler_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
     with pytest.raises(MissingDependencyError, match="sudo apt-get install g"):
-        native.compiler()
+        build.compiler()
 
 
 @pytest.mark.parametrize(
@@ -35,45 +37,45 @@ def test_without_a_compiler_the_message_says_what_to_install(monkeypatch):
 )
 def test_plugins_are_named_and_linked_as_the_platform_wants(monkeypatch, tmp_path, platform, suffix, flag):
     compiled = []
-    monkeypatch.setattr(native.sys, "platform", platform)
+    monkeypatch.setattr(build.sys, "platform", platform)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(native, "_compile", lambda words, flags: compiled.append((words[-1].name, flags[-1])))
-    native.build_mitsuba()
+    monkeypatch.setattr(build, "_compile", lambda words, flags: compiled.append((words[-1].name, flags[-1])))
+    build.build_mitsuba()
     assert compiled == [(f"nma{suffix}", flag), (f"layered{suffix}", flag)]
-    assert native.library().name == f"nma_c{suffix}"
+    assert build.library().name == f"nma_c{suffix}"
 
 
 def test_windows_is_refused_in_one_line(monkeypatch, tmp_path):
-    monkeypatch.setattr(native.sys, "platform", "win32")
+    monkeypatch.setattr(build.sys, "platform", "win32")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for build in (native.build_mitsuba, native.library):
+    for compiles in (build.build_mitsuba, build.library):
         with pytest.raises(
-            native.BuildError, match="Windows is not supported: .* Linux, and untested on macOS"
+            build.BuildError, match="Windows is not supported: .* Linux, and untested on macOS"
         ) as e:
-            build()
+            compiles()
         assert "\n" not in str(e.value)
 
 
 def test_what_the_compiler_says_is_passed_on(tmp_path):
     source = tmp_path / "broken.cpp"
     source.write_text("int main() { return nothing; }\n")
-    with pytest.raises(native.BuildError, match="error: .nothing. was not declared|error: use of undeclared"):
-        native._compile([source, "-o", tmp_path / "broken"], [])
+    with pytest.raises(build.BuildError, match="error: .nothing. was not declared|error: use of undeclared"):
+        build._compile([source, "-o", tmp_path / "broken"], [])
 
 
 def test_a_failed_build_leaves_nothing(tmp_path):
     def make(folder):
         (folder / "half").touch()
-        raise native.BuildError("no")
+        raise build.BuildError("no")
 
-    with pytest.raises(native.BuildError):
-        native._whole(tmp_path / "made", make)
+    with pytest.raises(build.BuildError):
+        build._whole(tmp_path / "made", make)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 def test_python_reaches_the_batched_kernel(tmp_path):
-    from nma.runtime import Runtime, available
+    from nma.native.runtime import Runtime, available
 
     rng = np.random.default_rng(0)
     params, cosines = nma.LAYERED3.sample(rng, 500), rng.uniform(0.05, 1, 500)

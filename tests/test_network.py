@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from adapter_cases import VARIANTS, materials, random_adapter
 
-from nma import encoding, network, target
+from nma import network, target
+from nma.adapter import encoding
 from nma.errors import NmaError, WeightsError
 from nma.jit import dr
 from nma.params import LAYERED3

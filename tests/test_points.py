@@ -9,14 +9,14 @@ from source_cases import LAMBERT, Formula, direction
 
 from nma import ops
 from nma.adapter import Adapter
+from nma.adapter.values import AdapterValues
 from nma.errors import NmaError, ParamError, SourceError, TableError
+from nma.evaluate.pairs import Pairs, compare
 from nma.ops import Color, Vec3
-from nma.pairs import Pairs, compare
-from nma.sources.adapter import AdapterValues
 from nma.sources.coating import Coating
 from nma.sources.mitsuba_bsdf import from_dict
 from nma.table import Grid, Tables
-from nma.tabulation import tabulate_values
+from nma.table.values import tabulate_values
 from nma.target import Principled, eval_principled
 from nma.train import recipe as recipes
 from nma.train.fit import fit, recipe_for

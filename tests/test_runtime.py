@@ -11,11 +11,11 @@ from density_cases import p_values
 from target_cases import random_blend, random_directions, stacked
 
 import nma
-from nma import encoding, network, target
-from nma.adapter import weights_file
+from nma import network, target
+from nma.adapter import encoding, weights_file
+from nma.native.runtime import INSTRUCTION_SETS, Runtime, available
 from nma.ops import Vec3
 from nma.params import MEASURED
-from nma.runtime import INSTRUCTION_SETS, Runtime, available
 
 ROOT = Path(__file__).parent.parent
 FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]

@@ -10,10 +10,11 @@ from adapter_cases import materials, random_anisotropic_adapter
 from target_cases import random_directions, stacked
 
 import nma
-from nma import encoding, network, target
+from nma import network, target
+from nma.adapter import encoding
 from nma.errors import ParamError
+from nma.native.runtime import Runtime, available
 from nma.ops import Vec3
-from nma.runtime import Runtime, available
 
 RUNTIME = Path(__file__).parent.parent / "runtime"
 CASES = 4000

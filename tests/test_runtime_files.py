@@ -20,15 +20,15 @@ from nma.errors import ParamError, WeightsError
 from nma.export.classes import classes
 from nma.export.cpp import cpp, print_function
 from nma.export.functions import Unsupported, parsed
+from nma.native.runtime import Runtime
 from nma.params import LAYERED3
-from nma.runtime import Runtime
 
 ROOT = Path(__file__).parent.parent
 IN_PLANE = {"name": "anisotropic", "size": 1, "low": 0, "high": 1, "scale": "linear", "in_plane": True}
 
 
 def stored(name):
-    return (ROOT / "nma/adapters" / f"{name}.safetensors").read_bytes()
+    return (ROOT / "nma/adapter/shipped" / f"{name}.safetensors").read_bytes()
 
 
 def header_of(name):

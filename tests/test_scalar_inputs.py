@@ -8,7 +8,7 @@ import pytest
 from adapter_cases import random_adapter
 from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
-from nma.image_io import write_exr, write_png
+from nma.images.io import write_exr, write_png
 
 # Each compiles plugins or renders in processes of its own.
 pytestmark = [pytest.mark.slow]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nma.errors import ParamError, TextureError
-from nma.image_io import ImageError, write_exr
+from nma.images.io import ImageError, write_exr
 from nma.llvm import ensure_llvm
 
 ensure_llvm()

@@ -13,12 +13,12 @@ from source_cases import numbers, pairs
 import nma.render
 from nma import materials
 from nma.adapter import Adapter
+from nma.adapter.values import AdapterValues
 from nma.errors import ParamError, WeightsError
-from nma.image_io import read_image
+from nma.images.io import read_image
 from nma.params import MEASURED
 from nma.render.load import SceneError, load_dict, material_bsdf
 from nma.render.scene import bitmap_texture
-from nma.sources.adapter import AdapterValues
 
 nma.render.use("llvm_ad_rgb")
 GOLD = materials.load("gold-red-lacquer")

@@ -8,8 +8,8 @@ from adapter_cases import materials, random_adapter
 from source_cases import direction, numbers
 
 from nma import sources
+from nma.adapter.values import AdapterValues
 from nma.errors import SourceError
-from nma.sources.adapter import AdapterValues
 from nma.sources.coating import Coating
 from nma.sources.merl import SHAPE, Merl
 from nma.sources.mitsuba_bsdf import from_dict

@@ -25,7 +25,7 @@ from nma.params import LAYERED3
 from nma.table import Tables
 from nma.train import loop, plot
 from nma.train import run as training
-from nma.train.data import BinSampler, Pool, draw
+from nma.train.batches import BinSampler, Pool, draw
 from nma.train.recipe import CLASS, PAPER, SINGLE, Recipe, preset
 
 QUICK = replace(SINGLE, network="1x16", rows=32, bins_per_row=8, points=32, steps=300, learning_rate=2e-2)

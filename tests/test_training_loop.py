@@ -11,7 +11,7 @@ pytest.importorskip("optax", reason="training needs optax, the extra [train]", e
 import jax
 
 from nma.train import loop
-from nma.train.data import Batch
+from nma.train.batches import Batch
 from nma.train.recipe import CLASS
 
 RECIPE = replace(CLASS, steps=400, learning_rate=0.1, schedule="onecycle", average=0.0)

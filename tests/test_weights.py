@@ -13,8 +13,8 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 from nma import adapter as adapters
-from nma import target, weights
-from nma.adapter import Adapter
+from nma import target
+from nma.adapter import Adapter, weights
 from nma.errors import WeightsError
 from nma.params import LAYERED3, ParamSpace
 

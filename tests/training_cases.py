@@ -11,7 +11,7 @@ from nma.ops import Color
 from nma.params import LAYERED3
 from nma.table import ISOTROPIC, Tables
 from nma.target import PRINCIPLED_PARAMS, STRETCHED_PARAMS, Blend, Principled
-from nma.train.data import BinSampler, Pool, draw
+from nma.train.batches import BinSampler, Pool, draw
 from nma.train.loss import bin_means, blend_of
 from nma.train.recipe import CLASS
 

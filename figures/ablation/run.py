@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
-from nma.dataset import Settings, simulate_block
+from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import preset
 from nma.train.run import train_class
 

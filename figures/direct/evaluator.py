@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import nma
-from nma import ava, network, ops
+from nma import network, ops
 from nma.network import Layers
 from nma.ops import Vec3
+from nma.table import quadrature
 from nma.train import loop
-from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.batches import Batch, BinSampler, Pool, draw
 from nma.train.loss import distance
 from nma.train.recipe import Recipe, preset
 
@@ -115,7 +116,7 @@ def _numbered(tables: nma.Tables) -> Pool:
 
 def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
     """The adapter's distance, with one random point in each bin for its mean."""
-    points = ava.uniform_bin_points(batch.i, batch.o, batch.p, tuple(batch.shift))
+    points = quadrature.uniform_bin_points(batch.i, batch.o, batch.p, tuple(batch.shift))
     latent = evaluator.latents[batch.columns[0].astype(jnp.int32)]
     wi = Vec3(*(jnp.broadcast_to(x, points.wo.z.shape) for x in points.wi))
     value = evaluate(evaluator.decoder, latent, wi, points.wo)

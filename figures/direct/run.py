@@ -25,12 +25,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma
-from nma import ava, encoding, network, target
+from nma import network, target
+from nma.adapter import encoding
 from nma.cli import console
-from nma.dataset import Settings, simulate_block
-from nma.metrics import mean_metrics, table_metrics
+from nma.evaluate.metrics import mean_metrics, table_metrics
 from nma.ops import Vec3
-from nma.table import ISOTROPIC
+from nma.table import ISOTROPIC, quadrature
+from nma.table.dataset import Settings, simulate_block
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
@@ -160,7 +161,7 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
     materials, seconds = [], []
     for number, table in enumerate(reference.values):
         u = np.random.default_rng((0x7AB1E5, number)).random((3, per_bin, ISOTROPIC.bins), np.float32)
-        points = ava.uniform_bin_points(*bins, tuple(u))
+        points = quadrature.uniform_bin_points(*bins, tuple(u))
         wi = Vec3(*(np.broadcast_to(x, points.wo.z.shape) for x in points.wi))
         began = time.perf_counter()
         value = evaluate(number, wi, points.wo)

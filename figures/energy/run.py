@@ -17,9 +17,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
-from nma import ava, ops, target
+from nma import ops, target
 from nma.jit import dr
 from nma.ops import Vec3
+from nma.table import quadrature
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
@@ -90,7 +91,7 @@ def _albedos(
     cosines = Float(mu.astype(np.float32))
     blend = adapter.blend(curves, cosines)
     wi = Vec3(ops.safe_sqrt(1.0 - cosines * cosines), 0.0 * cosines, cosines)
-    lattice = [Float(x.astype(np.float32)) for x in ((ava.lattice(samples) + shift) % 1.0).T]
+    lattice = [Float(x.astype(np.float32)) for x in ((quadrature.lattice(samples) + shift) % 1.0).T]
 
     def body(k, *sums):
         u = [dr.gather(Float, x, k) for x in lattice]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 import nma
 import nma.render
 from nma import materials
-from nma.contact_sheet import PAPER, Row, contact_sheet
-from nma.image_metrics import errors
+from nma.images.metrics import errors
+from nma.images.sheet import PAPER, Row, contact_sheet
 from nma.render.clamp import clamped
 from nma.render.demo import worn_silver
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf

@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 
 import nma
 import nma.render
-from nma import collection
+from nma.adapter.library import Library
 from nma.cli.console import TrainingBar, progress
-from nma.collection import Member
-from nma.image_io import tonemap
-from nma.library import Library
-from nma.table import Tables
+from nma.images.io import tonemap
+from nma.table import Tables, collection
+from nma.table.collection import Member
 from nma.train import library as training
 from nma.train.recipe import Recipe
 

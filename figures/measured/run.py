@@ -26,18 +26,18 @@ import nma
 import nma.render
 from nma import network
 from nma.adapter import Adapter
+from nma.adapter.values import AdapterValues
 from nma.cli.console import TrainingBar
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import flip_map
+from nma.evaluate.pairs import Pairs, compare
+from nma.images.metrics import flip_map
+from nma.images.sheet import Row, contact_sheet
 from nma.ops import Vec3
-from nma.pairs import Pairs, compare
 from nma.render.values_bsdf import bsdf_of
-from nma.sources.adapter import AdapterValues
 from nma.sources.base import Values
 from nma.sources.coating import Coating
 from nma.sources.mitsuba_bsdf import from_dict
 from nma.sources.nbrdf import WEIGHTS, Nbrdf
-from nma.tabulation import tabulate_values
+from nma.table.values import tabulate_values
 from nma.train.constant import CONSTANT, fit_constant
 from nma.train.fit import recipe_for
 

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 import nma
 import nma.render
 from nma.cli.console import progress
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import METRICS
+from nma.images.metrics import METRICS
+from nma.images.sheet import Row, contact_sheet
 from nma.render.load import material_bsdf
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

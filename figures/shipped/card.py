@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 import nma
 import nma.render
 from nma import network
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import compare_images, difference_image
-from nma.metrics import FIGURES
+from nma.evaluate.metrics import FIGURES
+from nma.images.metrics import compare_images, difference_image
+from nma.images.sheet import Row, contact_sheet
 from nma.render.load import load_dict
 from nma.render.progressive import render_passes
 

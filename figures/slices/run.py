@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma
-from nma.image_io import tonemap
+from nma.images.io import tonemap
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common

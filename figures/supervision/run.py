@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 import nma
 import nma.render
-from nma.contact_sheet import Row, contact_sheet
+from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
 from nma.render.load import load_dict, material_bsdf
 from nma.render.progressive import render_passes

@@ -19,8 +19,8 @@ import numpy as np
 
 import nma
 import nma.render
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import difference_image
+from nma.images.metrics import difference_image
+from nma.images.sheet import Row, contact_sheet
 from nma.render.demo import DEPTH, FLIP_SCALE, TEXTURE_SCALE
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
 from nma.render.progressive import render_passes

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from train import Job, Store
 
 import nma
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import METRICS
+from nma.images.metrics import METRICS
+from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
 from nma.render.load import material_bsdf
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nma.image_metrics import METRICS
+from nma.images.metrics import METRICS
 
 
 def _rows(text: str) -> dict[str, dict[str, float]]:

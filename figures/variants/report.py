@@ -11,7 +11,7 @@ from paper import PERCENT, TABLE_2, TABLE_3
 from train import INSTANCES, VARIANTS, Job
 
 import nma
-from nma.image_metrics import METRICS
+from nma.images.metrics import METRICS
 
 Results = dict[Job, dict[str, Any]]
 WORST, BEST = "single", "blended + omega_i"

@@ -13,7 +13,7 @@ from typing import Any
 
 import nma
 from nma.errors import NmaError
-from nma.metrics import mean_metrics
+from nma.evaluate.metrics import mean_metrics
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
 

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 import nma
-from nma.cli import data, datasets, learn, library, native, principled, system, view
+from nma.cli import data, learn, library, mitsuba, principled, simulate, system, view
 from nma.errors import NmaError, one_line
 
 
@@ -39,7 +39,7 @@ app = typer.Typer(
     "numbers, "
     "[bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
-for group in (data, datasets, learn, library, principled, view, native, system):
+for group in (simulate, data, learn, library, principled, view, mitsuba, system):
     group.register(app)
 
 

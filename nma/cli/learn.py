@@ -204,7 +204,7 @@ def evaluate(
     """
     from nma.adapter import Adapter
     from nma.evaluate import evaluate as run
-    from nma.metrics import FIGURES
+    from nma.evaluate.metrics import FIGURES
     from nma.table import Tables
 
     adapter = Adapter.load(weights)
@@ -237,8 +237,8 @@ def evaluate(
 
 def _compare(adapter, source) -> None:
     """Says how far the adapter is from a source with values."""
-    from nma.pairs import PAIRS, compare
-    from nma.sources.adapter import AdapterValues
+    from nma.adapter.values import AdapterValues
+    from nma.evaluate.pairs import PAIRS, compare
 
     figures = compare(AdapterValues(adapter), source)
     listed = ", ".join(f"{name} {value:.5f}" for name, value in figures.items())
@@ -257,7 +257,7 @@ def _target(directional: bool) -> str | None:
 
 def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
     """(tables of a dataset, or the settings of a stream; record of their origin)."""
-    from nma.dataset import Dataset, Settings
+    from nma.table.dataset import Dataset, Settings
 
     if (data is None) == (stream == 0):
         raise typer.BadParameter("give either --data DATASET or --stream MATERIALS")

@@ -44,7 +44,7 @@ def train_library(
 
     Example: [bold]nma train-library ~/merl -o library.safetensors[/bold]
     """
-    from nma import collection
+    from nma.table import collection
     from nma.train import library as training
     from nma.train.plot import plot_losses
 
@@ -88,7 +88,7 @@ def train_library(
 @library.command("list")
 def listing(path: _Library) -> None:
     """List the materials of a library."""
-    from nma.library import Library
+    from nma.adapter.library import Library
 
     for name in Library.load(path).names:
         console.tell(name)
@@ -111,9 +111,9 @@ def encode(
     Example: [bold]nma library encode library.safetensors paper_white_rgb.bsdf -o more.safetensors[/bold]
     """
     from nma import sources
+    from nma.adapter.library import Library
     from nma.errors import ParamError
-    from nma.library import Library
-    from nma.tabulation import tabulate_values
+    from nma.table.values import tabulate_values
     from nma.train import library as training
 
     files.try_file(output)
@@ -148,7 +148,7 @@ def extract(
 
     Example: [bold]nma library extract library.safetensors brass=.7 blue-rubber=.3 -o mixed.safetensors[/bold]
     """
-    from nma.library import Library
+    from nma.adapter.library import Library
 
     files.try_file(output)
     known = Library.load(path)

@@ -46,7 +46,7 @@ def tables_of(
     """The isotropic table of one material, and the record, as of `read`, with the number of `points_per_bin` where
     values were averaged over bins. Raises `SourceError` for anisotropic materials."""
     from nma.table import Tables
-    from nma.tabulation import POINTS, tabulate_values
+    from nma.table.values import POINTS, tabulate_values
 
     known, record = read(source, material, walks, seed)
     if isinstance(known, Tables):
@@ -67,7 +67,7 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
     """
     from nma import materials
     from nma.adapter import Adapter
-    from nma.sources.adapter import AdapterValues
+    from nma.adapter.values import AdapterValues
 
     path = _path(source, material)
     if path.suffix == ".npz" and _is_reference(path):

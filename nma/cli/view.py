@@ -173,10 +173,10 @@ def compare(
     Examples: [bold]nma compare test.exr reference.exr -o difference.png[/bold],
     [bold]nma compare gold-red-lacquer --spp 512[/bold]
     """
-    from nma import image_metrics
-    from nma.image_io import read_image
+    from nma.images import metrics
+    from nma.images.io import read_image
 
-    image_metrics.ensure_libraries()
+    metrics.ensure_libraries()
     if output:
         files.try_file(output)
     if reference is not None:
@@ -184,7 +184,7 @@ def compare(
         pictures = {"image": read_image(test), "reference": read_image(reference)}
     else:
         _refuse_unused(context)
-        image_metrics.check_size(_pixels(size))
+        metrics.check_size(_pixels(size))
         view = View(_pixels(size), spp, depth, camera, lighting, envmap, variant)
         if test.endswith(".safetensors"):
             _refuse(context, ("adapter", "changes"), "an adapter")
@@ -197,7 +197,7 @@ def compare(
         pictures = _renderings(material, view, seed, adapter, clamp)
     truth = pictures.pop("reference")
     errors = {
-        name: image_metrics.compare_images(picture, truth, ldr_exposure=exposure)
+        name: metrics.compare_images(picture, truth, ldr_exposure=exposure)
         for name, picture in pictures.items()
     }
     first = next(iter(pictures))
@@ -206,7 +206,7 @@ def compare(
     if as_json:
         print(json.dumps(errors[first] | ({"noise": errors["noise"]} if "noise" in errors else {})))
         return
-    rows = [(metric, *(values[metric] for values in errors.values())) for metric in image_metrics.METRICS]
+    rows = [(metric, *(values[metric] for values in errors.values())) for metric in metrics.METRICS]
     console.tell(f"{test} against {reference or 'its reference'}")
     console.out.print(console.table(("", *errors), rows))
 
@@ -225,14 +225,14 @@ def demo(
     Writes a sheet of pictures as soon as there are some, again whenever there is more to show, and prints the table
     below it. Takes about a minute on two CPU cores.
     """
-    from nma import image_metrics
+    from nma.images import metrics
 
-    image_metrics.ensure_libraries(ssim=False)
+    metrics.ensure_libraries(ssim=False)
     files.try_file(output)
     from nma.adapter import Adapter
     from nma.render import demo as demonstration
 
-    image_metrics.check_size(_pixels(size))
+    metrics.check_size(_pixels(size))
     Adapter.load(adapter)
     settings = demonstration.Settings(_pixels(size), spp, runs, reference_spp, adapter)
     use_rgb(variant)
@@ -304,7 +304,7 @@ def _samples_bar(title: str, total: int):
 
 def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float) -> None:
     """All channels as EXR, the colours as PNG."""
-    from nma.image_io import write_exr, write_png
+    from nma.images.io import write_exr, write_png
     from nma.render.channels import channel_names, colours
 
     names = channel_names(scene, image.shape[2])
@@ -314,8 +314,8 @@ def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float)
 
 
 def _write_difference(path: Path, title: str, name: str, test: Any, reference: Any, exposure: float) -> None:
-    from nma.contact_sheet import Row, contact_sheet
-    from nma.image_metrics import difference_image
+    from nma.images.metrics import difference_image
+    from nma.images.sheet import Row, contact_sheet
 
     difference = difference_image(test, reference, kind="flip", exposure=exposure)
     contact_sheet(

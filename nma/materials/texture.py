@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import TextureError, one_line
-from nma.image_io import ImageError, coloured_layer, load_bitmap
+from nma.images.io import ImageError, coloured_layer, load_bitmap
 from nma.params import Param
 
 # The channels of an image, by which one of them is chosen for a parameter of one number.

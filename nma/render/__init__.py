@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import contextlib
 
-from nma import native
 from nma.errors import MissingDependencyError, ParamError
 from nma.llvm import ensure_llvm
+from nma.native import build
 from nma.render import register as _plugins
 
 __all__ = ["use"]
@@ -51,6 +51,6 @@ def use(variant: str = "auto") -> str:
     if variant.startswith("llvm"):
         ensure_llvm()
     if variant == "scalar_rgb":
-        native.build_mitsuba()
+        build.build_mitsuba()
     mi.set_variant(variant)
     return variant

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from nma import encoding, network
-from nma.adapter import Adapter
+from nma import network
+from nma.adapter import Adapter, encoding
 from nma.jit import dr
 from nma.ops import Float
 from nma.target.blend import Blend

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import materials
-from nma.contact_sheet import Row, contact_sheet
-from nma.image_metrics import difference_image, errors, flip_map
+from nma.images.metrics import difference_image, errors, flip_map
+from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
 from nma.render.measure import Measurement, measure, render_seconds

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError, one_line
-from nma.image_io import load_bitmap
+from nma.images.io import load_bitmap
 from nma.llvm import ensure_llvm
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nma.errors import NmaError, ParamError, one_line
-from nma.image_io import check_size
+from nma.images.io import check_size
 from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.scene import bitmap_texture

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma.errors import ParamError
-from nma.image_io import ImageError
+from nma.images.io import ImageError
 
 Array = NDArray[np.float64]
 

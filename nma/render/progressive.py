@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError, one_line
-from nma.image_size import MOST_PIXELS
+from nma.images.size import MOST_PIXELS
 from nma.render.load import SceneError
 
 # Samples of one pass over the whole picture: a few seconds on two cores, and a bound on memory. A pixel of 512 x 512

@@ -6,8 +6,8 @@ import importlib
 from functools import partial
 from typing import Any
 
-from nma import native
 from nma.errors import ParamError
+from nma.native import build
 from nma.render.bsdf import VARIANTS
 
 # Name of the plugin, and the module whose `define()` makes its class for the present variant.
@@ -40,9 +40,9 @@ def register() -> None:
 def _on_variant(old: str | None, new: str) -> None:
     import mitsuba as mi
 
-    if new == "scalar_rgb" and native.has_mitsuba_plugins():
+    if new == "scalar_rgb" and build.has_mitsuba_plugins():
         # Python ones of the same name would hide them.
-        _add_resource(str(native.mitsuba_folder()))
+        _add_resource(str(build.mitsuba_folder()))
         return
     for name, module in PLUGINS.items():
         runs = new in VARIANTS

@@ -5,7 +5,7 @@ that `mi.traverse` shows: `material.*` is the material under test, `floor.*` the
 `sensor.*`. The only shape with the material is `ball`.
 
 Lengths are in units of the shell's radius, z is up. Radiance is scaled so that exposure 0 suits the picture
-(`nma.image_io.tonemap`): perfectly white paper outdoors has radiance 0.77 in the sun.
+(`nma.images.io.tonemap`): perfectly white paper outdoors has radiance 0.77 in the sun.
 """
 
 from __future__ import annotations

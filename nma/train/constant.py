@@ -13,13 +13,13 @@ from nma import target
 from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.evaluate import evaluate, tabulate_adapter
-from nma.metrics import table_metrics
+from nma.evaluate.metrics import table_metrics
 from nma.ops import Color
 from nma.params import SPACES
 from nma.table import ISOTROPIC, Tables
 from nma.target import PRINCIPLED_PARAMS, Blend, Principled, TargetParam
 from nma.train import loop
-from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.batches import Batch, BinSampler, Pool, draw
 from nma.train.loss import blend_loss
 from nma.train.recipe import Recipe
 from nma.train.run import record_of

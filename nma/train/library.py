@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from nma.adapter.library import Library
 from nma.errors import TableError
 from nma.evaluate import table_log_loss
-from nma.library import Library
 from nma.params import CODE_BOUND, LIBRARY
 from nma.progress import of_training
 from nma.table import ISOTROPIC, Tables
 from nma.train import loop
-from nma.train.data import Batch, BinSampler, Pool, draw
+from nma.train.batches import Batch, BinSampler, Pool, draw
 from nma.train.loss import bin_means, blend_of, distance, loss
 from nma.train.recipe import Recipe
 from nma.train.run import adapter_of, initial_layers

@@ -17,13 +17,13 @@ import optax
 
 from nma.errors import NmaError
 from nma.files import arrays, whole
-from nma.train.data import batches
+from nma.train.batches import batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
 
 # What is trained: any tree of arrays, for an adapter `nma.network.Layers`.
 Weights = Any
-# A named tuple of arrays, such as `nma.train.data.Batch`.
+# A named tuple of arrays, such as `nma.train.batches.Batch`.
 Batch = Any
 # (weights, batch, recipe) -> (what is minimised, the log loss that is reported).
 Objective = Callable[[Weights, Batch, Recipe], tuple[jax.Array, jax.Array]]

@@ -10,10 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from nma import ava, encoding, network, target
+from nma import network, target
+from nma.adapter import encoding
 from nma.network import Layers
 from nma.ops import Vec3
-from nma.train.data import Batch
+from nma.table import quadrature
+from nma.train.batches import Batch
 from nma.train.recipe import Recipe
 
 # Residuals of the log domain that the Huber loss treats as noise even where a bin has hardly any.
@@ -49,15 +51,15 @@ def view(batch: Any) -> Vec3:
     return Vec3(sin * jnp.cos(batch.phi), sin * jnp.sin(batch.phi), batch.mu)
 
 
-def _points(batch: Batch, recipe: Recipe) -> ava.Points:
+def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
     """Points (points, bins_per_row, rows) of every bin."""
     if recipe.points_law == "centre":
         u: Any = (0.5 + 0.0 * batch.shift)[:, None]
     else:
-        lattice = jnp.asarray(ava.lattice(recipe.points, len(batch.shift)), jnp.float32)
+        lattice = jnp.asarray(quadrature.lattice(recipe.points, len(batch.shift)), jnp.float32)
         u = (lattice.T[:, :, None, None] + batch.shift[:, None]) % 1.0
     finest = recipe.finest if recipe.points_law == "crowded" else None
-    return ava.points((batch.i, batch.a, batch.o, batch.p), tuple(u), recipe.grid, finest)
+    return quadrature.points((batch.i, batch.a, batch.o, batch.p), tuple(u), recipe.grid, finest)
 
 
 def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
@@ -65,7 +67,7 @@ def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
 
     The samples are held fixed while the target changes, so that derivatives are unbiased too, and none is clipped.
     """
-    lattice = jnp.asarray(ava.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
+    lattice = jnp.asarray(quadrature.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
     wi = view(batch)
     wo, _, pdf = target.sample(jax.lax.stop_gradient(blend), wi, *u)

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ava, ops, target
+from nma import ops, target
 from nma.errors import SourceError
 from nma.jit import dr
 from nma.microfacet import visible_normal_pdf
 from nma.ops import Vec3
 from nma.sources.base import Values
+from nma.table import quadrature
 from nma.target.sampling import sample_spec
 from nma.train.loss import albedo_loss, blend_of, view
 from nma.train.recipe import Recipe
@@ -37,7 +38,7 @@ _ROWS_PER_LAUNCH = 2048
 
 
 class PointBatch(NamedTuple):
-    """Points of one step; rows come last, as in `nma.train.data.Batch`."""
+    """Points of one step; rows come last, as in `nma.train.batches.Batch`."""
 
     columns: NDArray[np.float32]  # (0, rows): a single material has no parameters
     mu: NDArray[np.float32]  # (rows,) cos(theta_i)
@@ -113,7 +114,7 @@ def _evaluated(
     def lanes(x: NDArray) -> Any:
         return Float(np.ascontiguousarray(np.broadcast_to(x, (len(mu), points)), np.float32).ravel())
 
-    u = [lanes((x + s[:, None]) % 1.0) for x, s in zip(ava.lattice(points).T, shift, strict=True)]
+    u = [lanes((x + s[:, None]) % 1.0) for x, s in zip(quadrature.lattice(points).T, shift, strict=True)]
     sin = np.sqrt(1.0 - mu * mu)
     wi = Vec3(*(lanes(c[:, None]) for c in (sin * np.cos(phi), sin * np.sin(phi), mu)))
     wo, weight = _directions(wi, u, lanes(np.arange(points)[None] % _CROWDED == 0))

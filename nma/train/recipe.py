@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from nma import network
-from nma.ava import FINEST
 from nma.errors import NmaError
 from nma.table import ISOTROPIC, Grid
+from nma.table.quadrature import FINEST
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Recipe:
       "anisotropic", the same with lobes that are stretched along the surface's own axes.
     - `grid`: the resolution of the tables.
     - `bounded`: dim the target where it might reflect more light than it receives; directional ones only.
-    - `points_law`: "crowded" towards the mirror direction (`nma.ava`), "uniform" over the bin (the paper), or "centre",
-      one point in the middle of the bin (point supervision).
+    - `points_law`: "crowded" towards the mirror direction (`nma.table.quadrature`), "uniform" over the bin (the paper),
+      or "centre", one point in the middle of the bin (point supervision).
     - `finest`: microfacet width down to which points crowd.
     - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
     - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so

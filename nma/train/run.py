@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import platform
 import time
 from collections.abc import Callable
@@ -13,17 +14,16 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-import nma
-from nma import encoding, network, target
-from nma.adapter import Adapter
-from nma.dataset import Settings
+from nma import network, target
+from nma.adapter import Adapter, encoding
 from nma.network import Layers
 from nma.ops import Color
 from nma.params import ParamSpace
 from nma.table import Tables
+from nma.table.dataset import Settings
 from nma.target import Blend, Principled
 from nma.train import loop
-from nma.train.data import BinSampler, Pool, Stream, draw
+from nma.train.batches import BinSampler, Pool, Stream, draw
 from nma.train.recipe import Recipe
 
 # Where training starts: a coloured rough metal under a sharp, colourless reflection.
@@ -128,7 +128,7 @@ def record_of(recipe: Recipe, run: loop.Run) -> dict[str, Any]:
         "recipe": asdict(recipe),
         "steps": run.step,
         "seconds": round(run.seconds, 1),
-        "version": nma.__version__,
+        "version": importlib.metadata.version("neural-material-adapter"),
         "jax": jax.__version__,
         "date": time.strftime("%Y-%m-%d"),
     }

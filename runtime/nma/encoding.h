@@ -1,5 +1,5 @@
 // What the network reads: a material's parameters and the view direction, turned into about unit-sized numbers. Twin of
-// nma/encoding.py.
+// nma/adapter/encoding.py.
 #pragma once
 
 #include "kernels/macros.h"

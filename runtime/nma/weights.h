@@ -1,4 +1,4 @@
-// The weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of nma/weights.py.
+// The weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of nma/adapter/weights.py.
 #pragma once
 
 #include <algorithm>

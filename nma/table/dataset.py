@@ -24,7 +24,8 @@ from zarr.errors import ContainsArrayError
 from nma import sources
 from nma.errors import DatasetError
 from nma.params import Population
-from nma.table import ISOTROPIC, Tables, stream_keys, tabulate
+from nma.table.grid import ISOTROPIC, Tables
+from nma.table.walks import stream_keys, tabulate
 
 FORMAT = 1
 # Materials simulated at once, and walks that are lost at most when a run is killed; no influence on the result.

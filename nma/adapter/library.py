@@ -14,21 +14,15 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from safetensors import safe_open
 
 from nma import network
-from nma.adapter import Adapter, weights_file
+from nma.adapter.adapter import Adapter, weights_file
 from nma.errors import ParamError, WeightsError
 from nma.params import LIBRARY, MEASURED
-from nma.sources.base import Values
-from nma.table import Tables
-
-if TYPE_CHECKING:
-    from nma.train.library import Encoded
 
 CODES = "codes"
 
@@ -130,15 +124,3 @@ class Library:
             raise ParamError(f"the library has a material '{name}'; choose another name")
         codes = np.concatenate([self.codes, LIBRARY.check(code, "training").astype(np.float32)])
         return replace(self, names=(*self.names, name), codes=codes)
-
-    def encode(self, material: Tables | Values, **settings: Any) -> Encoded:
-        """Learns the code of a material that the library was not trained on, the network as it is.
-
-        `material` is a source, or a table. Takes half a minute or so, and the extra `train`; `settings` are those of
-        `nma.train.library.encode`.
-        """
-        from nma.tabulation import tabulate_values
-        from nma.train.library import encode
-
-        tables = material if isinstance(material, Tables) else tabulate_values(material)
-        return encode(self, tables, **settings)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nma import ava, ops
+from nma import ops
 from nma.jit import dr
 from nma.microfacet import ggx_d, smith_g1
 from nma.ops import Vec3
-from nma.table import Grid
+from nma.table import Grid, quadrature
 
 FALSE_ALARM = 1e-3
 REPEATS = 16
@@ -46,19 +46,19 @@ BINS = np.array(
 def shifted(n, shape, seed):
     """The lattice of n points (3, n, *shape), shifted at random for each entry."""
     shift = np.random.default_rng(seed).random((3, 1, *shape))
-    lattice = ava.lattice(n).T.reshape(3, n, *(1,) * len(shape))
+    lattice = quadrature.lattice(n).T.reshape(3, n, *(1,) * len(shape))
     return (lattice + shift) % 1.0
 
 
 def crowded(bins, n, seed, repeats=REPEATS):
     """Points (n, repeats, bins) of `bin_points`."""
     i, o, p = bins.T
-    return ava.bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
+    return quadrature.bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
 
 
 def uniform(bins, n, seed, repeats=REPEATS):
     i, o, p = bins.T
-    return ava.uniform_bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
+    return quadrature.uniform_bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
 
 
 def assert_means(estimates, expected):
@@ -102,7 +102,9 @@ def test_means_of_smooth_functions_are_exact(law):
 
 
 @pytest.mark.parametrize("dtype", (np.float32, np.float64))
-@pytest.mark.parametrize("law", (ava.bin_points, ava.uniform_bin_points), ids=("crowded", "uniform"))
+@pytest.mark.parametrize(
+    "law", (quadrature.bin_points, quadrature.uniform_bin_points), ids=("crowded", "uniform")
+)
 def test_points_lie_in_their_bins(law, dtype):
     """All 64,000 bins, at random points and at the ends of the unit cube."""
     i, o, p = (x.ravel().astype(dtype) for x in np.meshgrid(*[np.arange(40)] * 3, indexing="ij"))
@@ -149,12 +151,12 @@ def test_single_precision_is_enough_for_the_narrowest_lobe(name):
     i, o, p = (x.ravel() for x in np.meshgrid(np.arange(40.0), [-1, 0, 1], [38.0, 39.0], indexing="ij"))
     o = np.clip(i + o, 0, 39)
     u = np.random.default_rng(5).random((3, 50, len(i)), np.float32).astype(np.float64)
-    exact = ava.bin_points(i, o, p, tuple(u))
+    exact = quadrature.bin_points(i, o, p, tuple(u))
     expected = (exact.weight * lobe(exact.wi, exact.wo, 0.001)).ravel()
     i, o, p = (np.broadcast_to(x, u[0].shape) for x in (i, o, p))
     array = (lambda x: x) if name == "numpy" else dr.auto.Float
     bins = [array(np.ascontiguousarray(x, np.float32).ravel()) for x in (i, o, p, *u)]
-    points = ava.bin_points(*bins[:3], tuple(bins[3:]))
+    points = quadrature.bin_points(*bins[:3], tuple(bins[3:]))
     found = points.weight * lobe(points.wi, points.wo, 0.001)
     found = found if name == "numpy" else found.numpy()
     error = np.abs(found - expected) / expected
@@ -235,7 +237,7 @@ def test_other_grids_work_too():
     grid = Grid(8, 8, 5)
     bins = np.array([(0, 0, 4), (7, 7, 4), (3, 5, 0)], np.float64)
     i, o, p = bins.T
-    for law in (ava.bin_points, ava.uniform_bin_points):
+    for law in (quadrature.bin_points, quadrature.uniform_bin_points):
         points = law(i, o, p, tuple(shifted(2048, (REPEATS, 3), 9)), grid)
         for function, expected in (
             (1.0, np.ones(3)),
@@ -248,7 +250,7 @@ def test_other_grids_work_too():
 
 def test_lattice_points_are_well_spread():
     """Every one of 512 cells of the cube holds about its share of 4096 points."""
-    points = ava.lattice(4096)
+    points = quadrature.lattice(4096)
     assert points.shape == (4096, 3)
     cells = np.bincount((points * 8).astype(int) @ [64, 8, 1], minlength=512)
     assert cells.min() >= 4

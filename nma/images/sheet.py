@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nma.image_io import ImageError, as_image, to_8bit, tonemap, write_png
+from nma.images.io import ImageError, as_image, to_8bit, tonemap, write_png
 
 PAPER, INK, QUIET, RULE = (250, 249, 246), (32, 33, 36), (104, 106, 110), (214, 212, 206)
 TITLE_SIZE, TEXT_SIZE, CAPTION_SIZE, GAP, MARGIN = 22, 15, 13, 14, 26
@@ -49,7 +49,7 @@ def contact_sheet(
         title: a line on top.
         table: rows of text cells below the pictures; the first row is the heading, the first column is left-aligned.
         note: a quiet line at the bottom, such as the tone mapping or the machine.
-        exposure, shoulder: tone mapping of linear images, see `nma.image_io.tonemap`.
+        exposure, shoulder: tone mapping of linear images, see `nma.images.io.tonemap`.
 
     Returns:
         The sheet as (height, width, 3) bytes.

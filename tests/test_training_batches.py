@@ -16,9 +16,9 @@ pytest.importorskip("optax", reason="training needs optax, the extra [train]", e
 
 from training_cases import FALSE_ALARM, TINY, batch_of, lambertian
 
-from nma.dataset import Settings, simulate_block
 from nma.table import ISOTROPIC, Grid
-from nma.train.data import Batch, BinSampler, Pool, Stream, batches
+from nma.table.dataset import Settings, simulate_block
+from nma.train.batches import Batch, BinSampler, Pool, Stream, batches
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_streams_hold_the_newest_materials_and_depend_on_the_step_alone():
 
 
 def test_streams_replace_the_oldest_first(monkeypatch):
-    monkeypatch.setattr("nma.train.data.STREAM_BLOCK", 2)
+    monkeypatch.setattr("nma.train.batches.STREAM_BLOCK", 2)
     settings = Settings("layered3", 5, 40, 3)
     stream = Stream(settings, refresh=1)
     everything = simulate_block(settings, range(12)).params.astype(np.float32)

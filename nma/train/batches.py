@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.dataset import Settings, simulate_block
 from nma.table import ISOTROPIC, Grid, Tables
+from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import Recipe
 
 # Materials that a stream exchanges at a time: enough to keep the simulation's lanes busy.

@@ -5,15 +5,16 @@ import math
 import numpy as np
 import pytest
 from source_cases import LAMBERT, Formula, lanes, numbers, pairs
-from test_ava import LOBE_BINS, assert_means, lobe, mean_of_bin
+from test_quadrature import LOBE_BINS, assert_means, lobe, mean_of_bin
 
-from nma import ava, metrics, ops, tabulation
+from nma import ops
 from nma.errors import TableError
+from nma.evaluate import metrics
 from nma.ops import Color, Vec3
 from nma.sources.merl import Merl
 from nma.sources.mitsuba_bsdf import from_dict
-from nma.table import ISOTROPIC, Grid, Tables
-from nma.tabulation import TableValues, tabulate_values
+from nma.table import ISOTROPIC, Grid, Tables, quadrature, values
+from nma.table.values import TableValues, tabulate_values
 
 import mitsuba as mi  # isort: skip
 
@@ -55,7 +56,7 @@ def test_bins_of_a_lambertian_surface_hold_their_means(grid):
 
 def assert_close(tables, expected, grid):
     """Where points are spread evenly, means of linear functions are as good as exact; where they crowd, as stated."""
-    near = tabulation._near_mirror(np.arange(grid.bins), grid).reshape(grid.shape[:-1])
+    near = values._near_mirror(np.arange(grid.bins), grid).reshape(grid.shape[:-1])
     found, error = tables.values[0], tables.error[0]
     np.testing.assert_allclose(found[~near], expected[~near], rtol=2e-4)
     assert_as_stated(found[near], expected[near], error[near])
@@ -140,7 +141,7 @@ def test_stated_errors_are_the_spread_of_the_means():
 
 def test_equal_arguments_give_equal_tables_however_they_are_launched(monkeypatch):
     one = tabulate_values(ggx(0.1), grid=SMALL)
-    monkeypatch.setattr(tabulation, "_BINS_PER_LAUNCH", 17)
+    monkeypatch.setattr(values, "_BINS_PER_LAUNCH", 17)
     other = tabulate_values(ggx(0.1), grid=SMALL)
     np.testing.assert_array_equal(one.values, other.values)
     np.testing.assert_array_equal(one.error, other.error)
@@ -253,8 +254,8 @@ def test_points_of_anisotropic_bins_have_no_preference(crowded):
     bins = np.minimum(FOUR, [5, 9, 7, 11])
     i, a, o, b = bins.T
     shift = np.random.default_rng(8).random((4, 1, 16, len(bins)))
-    u = (ava.lattice(2048, 4).T.reshape(4, 2048, 1, 1) + shift) % 1.0
-    points = ava.points((i, a, o, b), u, grid, ava.FINEST if crowded else None)
+    u = (quadrature.lattice(2048, 4).T.reshape(4, 2048, 1, 1) + shift) % 1.0
+    points = quadrature.points((i, a, o, b), u, grid, quadrature.FINEST if crowded else None)
     mu_i, mu_o, phi_i, phi_o = (i + 0.5) / 6, (o + 0.5) / 8, (a + 0.5) * math.pi / 5, (b + 0.5) * math.pi / 6
     at_i, at_o = ((np.arctan2(w.y, w.x) % (2 * math.pi)) for w in (points.wi, points.wo))
     for k, (found, middle, half) in enumerate(((at_i, phi_i, math.pi / 10), (at_o, phi_o, math.pi / 12))):
@@ -276,7 +277,10 @@ def test_crowded_points_of_anisotropic_bins_have_the_mean_of_even_ones():
     grid, bins = Grid(6, 6, 12, phi_i=12), FOUR[[0, 3]]
     i, a, o, b = bins.T
     means = []
-    for law, n in ((ava.anisotropic_bin_points, 1 << 15), (ava.uniform_anisotropic_bin_points, 1 << 19)):
-        points = law(i, a, o, b, tuple(ava.lattice(n, 4).T[..., None]), grid)
+    for law, n in (
+        (quadrature.anisotropic_bin_points, 1 << 15),
+        (quadrature.uniform_anisotropic_bin_points, 1 << 19),
+    ):
+        points = law(i, a, o, b, tuple(quadrature.lattice(n, 4).T[..., None]), grid)
         means.append((points.weight * lobe(points.wi, points.wo, 0.05)).mean(axis=0))
     np.testing.assert_allclose(means[0], means[1], rtol=0.03)

@@ -10,8 +10,8 @@ from PIL import Image
 
 from nma import materials
 from nma.errors import NmaError
-from nma.image_io import ImageError, load_bitmap, read_image, write_exr
-from nma.image_size import header_size
+from nma.images.io import ImageError, load_bitmap, read_image, write_exr
+from nma.images.size import header_size
 from nma.render.load import load_scene
 from nma.render.scene import preview_scene
 

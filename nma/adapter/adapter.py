@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nma import encoding, network, ops, weights
-from nma.encoding import Tangent
+from nma import network, ops
+from nma.adapter import encoding, weights
+from nma.adapter.encoding import Tangent
 from nma.errors import ParamError, WeightsError
 from nma.network import Layers
 from nma.ops import Float
@@ -30,6 +31,7 @@ from nma.target.decode import (
 )
 from nma.target.principled import DIALECT
 
+_SHIPPED = files("nma.adapter").joinpath("shipped")
 # Parameters that differ by less, relative to their size, are of the same material: rounding to single precision.
 _SAME = 1e-5
 
@@ -38,9 +40,7 @@ def shipped() -> tuple[str, ...]:
     """Names of the adapters that come with the package."""
     return tuple(
         sorted(
-            p.name.removesuffix(".safetensors")
-            for p in files("nma.adapters").iterdir()
-            if p.name.endswith(".safetensors")
+            p.name.removesuffix(".safetensors") for p in _SHIPPED.iterdir() if p.name.endswith(".safetensors")
         )
     )
 
@@ -48,7 +48,7 @@ def shipped() -> tuple[str, ...]:
 def weights_file(name_or_path: str | Path) -> Path:
     """The file of a shipped adapter's name, or the path as it is."""
     if str(name_or_path) in shipped():
-        return Path(str(files("nma.adapters").joinpath(f"{name_or_path}.safetensors")))
+        return Path(str(_SHIPPED.joinpath(f"{name_or_path}.safetensors")))
     return Path(name_or_path)
 
 

@@ -16,9 +16,9 @@ def register(app: typer.Typer) -> None:
 @mitsuba.command()
 def build() -> None:
     """Compile the BSDFs nma and layered for scalar_rgb against the installed Mitsuba, some ten seconds, once."""
-    from nma import native
+    from nma.native import build
 
-    folder = native.build_mitsuba(console.say)
+    folder = build.build_mitsuba(console.say)
     console.say(
         f'In Python: nma.render.use("scalar_rgb"). On the command line: mitsuba -a {folder} -m scalar_rgb SCENE.xml'
     )

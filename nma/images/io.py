@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nma.errors import NmaError, one_line
 from nma.files import whole, write_bytes
-from nma.image_size import MOST_PIXELS, header_size
+from nma.images.size import MOST_PIXELS, header_size
 
 
 class ImageError(NmaError, ValueError):

@@ -40,7 +40,7 @@ class BuildError(NmaError, RuntimeError):
 def sources() -> Path:
     """The folder of the C++ runtime: of a checkout, or as the wheel has it."""
     package = Path(__file__).parent
-    for folder in (package / "runtime", package.parent / "runtime"):
+    for folder in (package / "cpp", package.parent.parent / "runtime"):
         if (folder / "nma.h").exists():
             return folder
     raise NmaError(f"the C++ runtime is not beside {package}; install the package again")

@@ -15,8 +15,8 @@ from nma import sources
 from nma.errors import SourceError
 from nma.sources import nbrdf
 from nma.sources.base import Values
-from nma.table import Tables, kept
-from nma.tabulation import tabulate_values
+from nma.table.grid import Tables, kept
+from nma.table.values import tabulate_values
 
 # What is in the name of a table beside the material's, so that a table of another file is not taken for its own.
 _DIGEST = 12

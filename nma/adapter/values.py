@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nma import target
-from nma.adapter import Adapter
+from nma.adapter.adapter import Adapter
 from nma.errors import ParamError
 from nma.ops import Color, Vec3
 from nma.target import Plane

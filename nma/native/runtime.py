@@ -1,6 +1,6 @@
 """The C++ runtime from Python, for many queries at once: a compiled library, made when it is first wanted.
 
-    runtime = nma.runtime.Runtime("layered3-5x64")
+    runtime = nma.native.runtime.Runtime("layered3-5x64")
     materials = runtime.prepare(params, wi)                    # (n, 13) in the training range, (n, 3)
     value, pdf = runtime.eval(materials, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
     wo, value, pdf = runtime.sample(materials, wi, u)
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nma import native
 from nma.adapter import weights_file
 from nma.errors import ParamError, WeightsError
+from nma.native import build
 
 Array = NDArray[np.float32]
 # As nma_c.h numbers them.
@@ -201,7 +201,7 @@ def _pointer(array: Array) -> Any:
 
 @cache
 def _library() -> ctypes.CDLL:
-    loaded = ctypes.CDLL(str(native.library()))
+    loaded = ctypes.CDLL(str(build.library()))
     loaded.nma_load.restype = ctypes.c_void_p
     loaded.nma_load.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t]
     loaded.nma_parameter_name.restype = ctypes.c_char_p

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nma import image_io
-from nma.contact_sheet import Row, contact_sheet
 from nma.errors import MissingDependencyError
-from nma.image_io import ImageError, read_image, tonemap, write_exr, write_png
-from nma.image_metrics import METRICS, compare_images, difference_image, errors, flip_map
+from nma.images import io
+from nma.images.io import ImageError, read_image, tonemap, write_exr, write_png
+from nma.images.metrics import METRICS, compare_images, difference_image, errors, flip_map
+from nma.images.sheet import Row, contact_sheet
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ def test_exr_on_one_core(tmp_path: Path):
     """In a process of its own, which would hang where OpenEXR finds no second thread."""
     program = (
         "import drjit, sys; drjit.set_thread_count(1)\n"
-        "from nma.image_io import read_image, write_exr\n"
+        "from nma.images.io import read_image, write_exr\n"
         "print(read_image(write_exr(sys.argv[1], [[[1.0, 2.0, 3.0]]])).tolist(), drjit.thread_count())"
     )
     words = [sys.executable, "-c", program, str(tmp_path / "one.exr")]
@@ -148,7 +148,7 @@ def test_exr_on_one_core(tmp_path: Path):
 def test_png_holds_the_tonemapped_picture(tmp_path: Path, picture):
     path = write_png(tmp_path / "a.png", picture, exposure=-1.0, shoulder=1.0)
     shown = np.asarray(Image.open(path))
-    np.testing.assert_array_equal(shown, image_io.to_8bit(tonemap(picture, exposure=-1.0)))
+    np.testing.assert_array_equal(shown, io.to_8bit(tonemap(picture, exposure=-1.0)))
     np.testing.assert_allclose(read_image(path), np.minimum(picture / 2.0, 1.0), atol=0.01)
 
 
@@ -177,7 +177,7 @@ def test_unreadable_images_are_refused(tmp_path: Path, picture):
 
 
 def test_contact_sheet_shows_the_pictures(tmp_path: Path, picture):
-    bytes_ = image_io.to_8bit(tonemap(picture, shoulder=0.8))
+    bytes_ = io.to_8bit(tonemap(picture, shoulder=0.8))
     rows = [Row("first", [picture, bytes_], ["2.1 s\nvariance .01"]), Row("second", [picture, picture])]
     sheet = contact_sheet(
         tmp_path / "a.png", rows, ["Left", "Right"], title="Title", table=[["", "a"], ["x", "1"]], note="note"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import metrics
+from nma.evaluate import metrics
 from nma.sources.base import Values, direction
 
 PAIRS = 20_000
@@ -44,6 +44,6 @@ class Pairs:
 
 
 def compare(model: Values, reference: Values, pairs: Pairs | None = None) -> dict[str, float]:
-    """Log loss, AE and SMAPE of f cos(theta_o) (`nma.metrics`), means over pairs and RGB."""
+    """Log loss, AE and SMAPE of f cos(theta_o) (`nma.evaluate.metrics`), means over pairs and RGB."""
     pairs = pairs or Pairs.draw()
     return metrics.value_metrics(pairs.values(model), pairs.values(reference))

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ava, ops
+from nma import ops
 from nma.errors import TableError
 from nma.jit import dr
 from nma.ops import Color, Float, Vec3
 from nma.sources.base import Values
 from nma.sources.lookup import Lookup
-from nma.table import ISOTROPIC, Grid, Tables
+from nma.table import quadrature
+from nma.table.grid import ISOTROPIC, Grid, Tables
 
 # Points of a bin, unless asked for otherwise. Bins around the mirror direction get so many times more, crowded towards
 # it: there are few of them, and they hold the peaks of smooth materials.
@@ -137,13 +138,13 @@ def _moments(
     place = tuple(Float(k) for k in _indices(flat, grid))
     dimensions = 4 if grid.phi_i else 3
     seed, last = dr.opaque(UInt32, number), dr.opaque(UInt32, count)
-    shifts = [ava.hashed(flat * dimensions + k, seed) for k in range(dimensions)]
-    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(count // 2, dimensions).T]
+    shifts = [quadrature.hashed(flat * dimensions + k, seed) for k in range(dimensions)]
+    lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(count // 2, dimensions).T]
 
     def body(k: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
-        u = [ava.shifted(dr.gather(Float, x, k >> 1), s) for x, s in zip(lattice, shifts, strict=True)]
+        u = [quadrature.shifted(dr.gather(Float, x, k >> 1), s) for x, s in zip(lattice, shifts, strict=True)]
         u = [dr.select((k & 1) == 0, x, 1.0 - x) * (1.0 - 2.0 * _EDGE) + _EDGE for x in u]
-        wi, wo, w = ava.points(place, u, grid, ava.FINEST if crowded else None)
+        wi, wo, w = quadrature.points(place, u, grid, quadrature.FINEST if crowded else None)
         if not grid.phi_i:
             # A folded bin is both of its mirror halves: every other pair of points goes to the other one.
             wo = Vec3(wo.x, dr.select((k & 2) == 0, wo.y, -wo.y), wo.z)

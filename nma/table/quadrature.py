@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nma import ops
 from nma.jit import dr
 from nma.ops import Float, Vec3
-from nma.table import ISOTROPIC, Grid
+from nma.table.grid import ISOTROPIC, Grid
 
 # Points crowd towards the mirror direction down to this microfacet width: half of the narrowest lobe's, as coarser
 # points make training broaden such lobes.

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ava, metrics, ops, target
+from nma import ops, target
 from nma.adapter import Adapter
 from nma.errors import TableError
+from nma.evaluate import metrics
 from nma.jit import dr
 from nma.ops import Vec3
-from nma.table import ISOTROPIC, Grid, Tables, bin_index
+from nma.table import ISOTROPIC, Grid, Tables, quadrature
+from nma.table.walks import bin_index
 
 # The network runs at this many cos(theta_i) in each row of the table. For each of them the target is evaluated at this
 # many wo in each bin, and at this many wo drawn from its own lobes.
@@ -55,7 +57,9 @@ def tabulate_adapter(
     Raises `ParamError` for parameters outside of the training range, or moves them to it with `clamp`.
     """
     if adapter.anisotropic:
-        raise TableError("an anisotropic adapter has no isotropic table; compare it by pairs (nma.pairs)")
+        raise TableError(
+            "an anisotropic adapter has no isotropic table; compare it by pairs (nma.evaluate.pairs)"
+        )
     params = adapter.check(params, clamp)
     strata = np.arange(grid.theta_i * (directions or _DIRECTIONS))
     jitter = (strata * 0.6180339887 + 0.31 + shift) % 1.0
@@ -95,16 +99,16 @@ def _by_points(
     row = bins // (grid.theta_o * grid.phi_o)
     o = Float((bins // grid.phi_o) % grid.theta_o)
     p = Float(bins % grid.phi_o)
-    shifts = [ava.hashed(bins * 2 + k, seed) for k in range(2)]
-    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(directions * _POINTS).T[:2]]
+    shifts = [quadrature.hashed(bins * 2 + k, seed) for k in range(2)]
+    lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(directions * _POINTS).T[:2]]
 
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
         at = row * directions + k // _POINTS
         mu = dr.gather(Float, cosines, at)
         blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
-        u, v = (ava.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
+        u, v = (quadrature.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
         across = mu * grid.theta_i - Float(row)
-        points = ava.uniform_bin_points(Float(row), o, p, (across, u, v), grid)
+        points = quadrature.uniform_bin_points(Float(row), o, p, (across, u, v), grid)
         value, pdf = target.eval_pdf(blend, points.wi, points.wo)
         value = value * (1.0 - _sharpness(pdf))
         return k + 1, red + value.x, green + value.y, blue + value.z
@@ -126,8 +130,9 @@ def _by_samples(
     at, k = lane // _SAMPLES, lane % _SAMPLES
     mu = dr.gather(Float, cosines, at)
     blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
-    lattice = [Float(x.astype(np.float32)) for x in ava.lattice(_SAMPLES).T]
-    u = [ava.shifted(dr.gather(Float, x, k), ava.hashed(at * 3 + n, ~seed)) for n, x in enumerate(lattice)]
+    lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(_SAMPLES).T]
+    shifts = [quadrature.hashed(at * 3 + n, ~seed) for n in range(len(lattice))]
+    u = [quadrature.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True)]
     wo, value, pdf = target.sample(blend, Vec3(ops.safe_sqrt(1.0 - mu * mu), 0.0 * mu, mu), *u)
     value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
     directions = len(cosines) // grid.theta_i

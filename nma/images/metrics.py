@@ -1,4 +1,4 @@
-"""How far a rendered image is from its reference: numbers here, sheets of pictures in `nma.contact_sheet`.
+"""How far a rendered image is from its reference: numbers here, sheets of pictures in `nma.images.sheet`.
 
 With a the test and b the reference, linear sRGB, means over pixels and channels, fractions rather than percent:
 
@@ -9,7 +9,7 @@ With a the test and b the reference, linear sRGB, means over pixels and channels
     flip_ldr   mean FLIP of Andersson et al. 2020 on display values, 67 pixels per degree (flip-evaluator)
     flip_hdr   mean HDR-FLIP of Andersson et al. 2021 on linear values, ACES, exposures chosen from the reference
 
-Display values are `nma.image_io.tonemap` at `ldr_exposure` with plain clipping. Equal images give ssim 1, all else 0.
+Display values are `nma.images.io.tonemap` at `ldr_exposure` with plain clipping. Equal images give ssim 1, all else 0.
 SSIM and FLIP come from the extra `compare`.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma.errors import MissingDependencyError
-from nma.image_io import ImageError, as_image, tonemap
+from nma.images.io import ImageError, as_image, tonemap
 
 Image = NDArray[np.float32]
 EPS = 0.01

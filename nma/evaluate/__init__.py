@@ -1,0 +1,5 @@
+"""How good a model of a material is: figures of adapters against tables, and of one source against another."""
+
+from nma.evaluate.adapters import Evaluation, evaluate, table_log_loss, tabulate_adapter
+
+__all__ = ["Evaluation", "evaluate", "table_log_loss", "tabulate_adapter"]

@@ -1,0 +1,1 @@
+"""The C++ runtime from Python: what compiles it, and what calls it."""
