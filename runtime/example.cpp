@@ -1,7 +1,7 @@
 // Prints the directional albedo of a material by sampling it: what a renderer does at every shading point.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example.cpp -o example
-//     ./example nma/adapter/shipped/layered3-5x64.safetensors
+//     ./example nma/adapter/trained/layered3-5x64.safetensors
 #include "nma.h"
 
 #include <cstdio>

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from nma import evaluate, target
+from nma import target
 from nma.adapter import Adapter
 from nma.errors import ParamError, TableError
-from nma.evaluate import metrics, tabulate_adapter
+from nma.evaluate import adapters, metrics, tabulate_adapter
 from nma.evaluate.metrics import counting_error, noise_floor, table_metrics
 from nma.jit import dr
 from nma.ops import Color, Vec3
@@ -49,7 +49,7 @@ def constant(blend, slope=0.0):
 @pytest.fixture
 def coarse(monkeypatch):
     """Integration with few points, for what does not need to be exact."""
-    monkeypatch.setattr(evaluate, "_DIRECTIONS", 4)
+    monkeypatch.setattr(adapters, "_DIRECTIONS", 4)
 
 
 @cache
@@ -154,7 +154,7 @@ def reference(table, error=None):
 def test_an_adapter_agrees_with_its_own_table():
     adapter = constant(BLENDS["coats of .001 over paint"], 0.5)
     table = tabulate_adapter(adapter, PARAMS[:1], shift=0.25)
-    result = evaluate.evaluate(adapter, reference(table, np.zeros_like(table)))
+    result = adapters.evaluate(adapter, reference(table, np.zeros_like(table)))
     assert result.mean["log_loss"] < 4e-4
     assert result.mean["albedo_error"] < 2e-3
     assert result.mean["noise_floor"] == 0.0
@@ -169,7 +169,7 @@ def test_an_evaluation_is_json_and_says_what_it_assumes():
     adapter = constant(BLENDS["alpha .1"])
     tables = 1.1 * tabulate_adapter(adapter, PARAMS[:2])
     done = []
-    result = evaluate.evaluate(adapter, reference(tables), done.append)
+    result = adapters.evaluate(adapter, reference(tables), done.append)
     assert done == [1, 2]
     assert result.estimated_error
     text = json.dumps({"mean": result.mean, "materials": result.materials}, allow_nan=False)
@@ -186,9 +186,9 @@ def test_an_evaluation_is_json_and_says_what_it_assumes():
 def test_references_that_cannot_be_compared_are_refused():
     adapter = constant(BLENDS["alpha .1"])
     with pytest.raises(TableError, match="evaluation wants isotropic tables"):
-        evaluate.evaluate(adapter, reference(np.zeros((1, 4, 5, 6, 3), np.float32)))
+        adapters.evaluate(adapter, reference(np.zeros((1, 4, 5, 6, 3), np.float32)))
     with pytest.raises(TableError, match="no material"):
-        evaluate.evaluate(adapter, reference(np.zeros((0, *ISOTROPIC.shape), np.float32)))
+        adapters.evaluate(adapter, reference(np.zeros((0, *ISOTROPIC.shape), np.float32)))
 
 
 @pytest.mark.usefixtures("coarse")
@@ -208,8 +208,8 @@ def test_materials_beyond_the_training_range_are_refused_or_clamped():
     table = tabulate_adapter(adapter, params, clamp=True)
     tables = Tables(params, table, np.array([40]))
     with pytest.raises(ParamError, match="sigma_t"):
-        evaluate.evaluate(adapter, tables)
-    assert evaluate.evaluate(adapter, tables, clamp=True).mean["log_loss"] < 2e-3
+        adapters.evaluate(adapter, tables)
+    assert adapters.evaluate(adapter, tables, clamp=True).mean["log_loss"] < 2e-3
 
 
 @pytest.mark.usefixtures("coarse")

@@ -28,7 +28,7 @@ IN_PLANE = {"name": "anisotropic", "size": 1, "low": 0, "high": 1, "scale": "lin
 
 
 def stored(name):
-    return (ROOT / "nma/adapter/shipped" / f"{name}.safetensors").read_bytes()
+    return (ROOT / "nma/adapter/trained" / f"{name}.safetensors").read_bytes()
 
 
 def header_of(name):

@@ -10,7 +10,7 @@ from adapter_cases import random_anisotropic_adapter
 
 ROOT = Path(__file__).parent.parent
 RUNTIME = ROOT / "runtime"
-WEIGHTS = [ROOT / f"nma/adapter/shipped/{name}.safetensors" for name in ("layered3-5x64", "layered3-3x32")]
+WEIGHTS = [ROOT / f"nma/adapter/trained/{name}.safetensors" for name in ("layered3-5x64", "layered3-3x32")]
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-pthread", f"-I{RUNTIME}"]
 # The second compiler, and most of what follows, waits for `make test-all`.
 COMPILERS = ["g++", pytest.param("clang++", marks=pytest.mark.slow)]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from nma import ops, sources, table
+from nma import ops, sources
 from nma.errors import ParamError, TableError
 from nma.jit import dr
 from nma.ops import Vec3
 from nma.params import LAYERED3, Param, ParamSpace
 from nma.sources.base import Walk
-from nma.table import ISOTROPIC, Grid, Tables, stream_keys, tabulate
+from nma.table import ISOTROPIC, Grid, Tables, stream_keys, tabulate, walks
 
 FALSE_ALARM = 1e-3
 SMALL = Grid(4, 5, 6)
@@ -180,29 +180,29 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
 
 def test_a_table_depends_on_its_own_key_alone(monkeypatch):
     """Neither company, nor order, nor the launches that the work is split into."""
-    source, walks = sources.get("layered3"), 40 * 1000
+    source, count = sources.get("layered3"), 40 * 1000
     params = LAYERED3.sample(np.random.default_rng(4), 5)
     keys = stream_keys(9, range(5))
-    together = tabulate(source, params, walks, keys)
-    alone = [tabulate(source, params[n : n + 1], walks, keys[n : n + 1]) for n in range(5)]
-    monkeypatch.setattr(table, "_BINS_PER_LAUNCH", 2 * ISOTROPIC.bins)
-    monkeypatch.setattr(table, "_WALKS_PER_ROW", 317)
-    split = tabulate(source, params[::-1], walks, keys[::-1])
+    together = tabulate(source, params, count, keys)
+    alone = [tabulate(source, params[n : n + 1], count, keys[n : n + 1]) for n in range(5)]
+    monkeypatch.setattr(walks, "_BINS_PER_LAUNCH", 2 * ISOTROPIC.bins)
+    monkeypatch.setattr(walks, "_WALKS_PER_ROW", 317)
+    split = tabulate(source, params[::-1], count, keys[::-1])
     for name in ("values", "error"):
         whole = getattr(together, name)
         np.testing.assert_array_equal(whole, np.concatenate([getattr(t, name) for t in alone]))
         np.testing.assert_array_equal(whole, getattr(split, name)[::-1])
-    without = tabulate(source, params, walks, keys, error=False)
+    without = tabulate(source, params, count, keys, error=False)
     assert without.error is None
     np.testing.assert_array_equal(without.values, together.values)
-    other = tabulate(source, params, walks, stream_keys(10, range(5)))
+    other = tabulate(source, params, count, stream_keys(10, range(5)))
     assert (other.values != together.values).any(axis=(1, 2, 3, 4)).all()
 
 
 def test_launches_of_an_anisotropic_table_continue_each_other(monkeypatch):
     grid = Grid(3, 4, 4, phi_i=3)
     whole = scatter_tables(Lopsided(), grid, 9 * 500)
-    monkeypatch.setattr(table, "_WALKS_PER_ROW", 61)
+    monkeypatch.setattr(walks, "_WALKS_PER_ROW", 61)
     np.testing.assert_array_equal(scatter_tables(Lopsided(), grid, 9 * 500).values, whole.values)
 
 
@@ -242,7 +242,7 @@ def test_stream_keys_depend_on_seed_and_index():
 
 def test_no_more_memory_than_stated():
     """The launch of many materials counts in a bounded number of bins."""
-    assert table._BINS_PER_LAUNCH * 3 * 2 * (4 + 8) <= 2**28
+    assert walks._BINS_PER_LAUNCH * 3 * 2 * (4 + 8) <= 2**28
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from nma.target.decode import (
 )
 from nma.target.principled import DIALECT
 
-_SHIPPED = files("nma.adapter").joinpath("shipped")
+_SHIPPED = files("nma.adapter").joinpath("trained")
 # Parameters that differ by less, relative to their size, are of the same material: rounding to single precision.
 _SAME = 1e-5
 

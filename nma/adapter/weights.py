@@ -1,7 +1,8 @@
 """The weights file: safetensors, with everything needed to use the network as JSON in its header.
 
 Tensors `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight`, ... float32; a library
-(`nma.adapter.library`) has one more. The header's metadata has one entry, `nma`, a JSON object with the fields of `Header`.
+(`nma.adapter.library`) has one more. The header's metadata has one entry, `nma`, a JSON object with the
+fields of `Header`.
 """
 
 from __future__ import annotations

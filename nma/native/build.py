@@ -23,6 +23,7 @@ from pathlib import Path
 from nma.errors import MissingDependencyError, NmaError
 
 PLUGINS = ("nma", "layered")
+_ADAPTERS = Path(__file__).parent.parent / "adapter" / "trained"
 # Those of Mitsuba's wheel. How vectors are passed depends on the instruction set: with another one, plugins load
 # and return nonsense.
 _MITSUBA_FLAGS = (
@@ -91,7 +92,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
             say(f"compiling {plugin.name}")
             # Libraries come after what needs them.
             _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", plugin], flags)
-        shutil.copytree(Path(__file__).parent / "adapters", into / "adapters")
+        shutil.copytree(_ADAPTERS, into / "adapters")
 
     _whole(folder, make)
     return folder
@@ -176,7 +177,7 @@ def _cache() -> Path:
 def _digest(*packages: str) -> str:
     """Of the sources, the shipped adapters, and the versions of these packages."""
     digest = hashlib.sha256()
-    folders = (sources(), Path(__file__).parent / "adapters") if packages else (sources(),)
+    folders = (sources(), _ADAPTERS) if packages else (sources(),)
     for file in sorted(f for folder in folders for f in folder.rglob("*") if f.is_file()):
         digest.update(file.name.encode() + file.read_bytes())
     for name in packages:
