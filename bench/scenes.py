@@ -17,9 +17,9 @@ import nma.render.textures
 from nma.materials import Material
 from nma.render.lighting import LAMP_RADIANCE
 from nma.render.load import material_bsdf
-from nma.render.scene import Camera, bitmap_texture, preview_scene
+from nma.render.scene import Camera, preview_scene
 from nma.render.shaderball import shader_ball_file
-from nma.render.textures import periodic_noise, procedural_textures
+from nma.render.textures import bitmap_texture, periodic_noise, procedural_textures
 
 DEPTH, RR_DEPTH = 6, 5  # longest path, and Mitsuba's default for where Russian roulette begins
 SIMULATION, STAND_IN, NOTHING = "layered", "principled", "diffuse"

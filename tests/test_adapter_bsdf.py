@@ -18,7 +18,7 @@ from nma.adapter import Adapter, shipped
 from nma.jit import dr
 from nma.ops import Vec3
 from nma.params import LAYERED3
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 TEXTURED = {"alpha_bottom": 0.3, "albedo": [0.9, 0.3, 0.2], "sigma_t": 0.7}

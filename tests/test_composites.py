@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 import nma.render
 from nma.jit import dr
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 from nma.render.values_bsdf import bsdf_of
 from nma.sources.coating import Coating
 

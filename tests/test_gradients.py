@@ -7,7 +7,7 @@ from adapter_cases import random_adapter
 
 import nma.render
 from nma.jit import dr
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 

@@ -13,7 +13,7 @@ import nma.render
 from nma import target
 from nma.adapter import Adapter
 from nma.jit import dr
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 MATERIAL = {"type": "nma", "adapter": "layered3-3x32", "material": "frosted-silver"}

@@ -8,8 +8,9 @@ import nma.render
 from nma.images.io import read_image
 from nma.render.load import load_dict
 from nma.render.mesh import HEIGHT, LIFT, WIDTH, MeshError, mesh_shape
-from nma.render.scene import bitmap_texture, preview_scene
+from nma.render.scene import preview_scene
 from nma.render.shaderball import shader_ball, write_ply
+from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 import mitsuba as mi  # noqa: E402

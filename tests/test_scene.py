@@ -16,9 +16,9 @@ mi.set_variant("llvm_ad_rgb")
 
 from nma.render import measure as measuring  # noqa: E402
 from nma.render.lighting import LIGHTINGS  # noqa: E402
-from nma.render.scene import CAMERAS, Camera, bitmap_texture, material_coverage, preview_scene  # noqa: E402
+from nma.render.scene import CAMERAS, Camera, material_coverage, preview_scene  # noqa: E402
 from nma.render.shaderball import shader_ball, shader_ball_file  # noqa: E402
-from nma.render.textures import procedural_textures  # noqa: E402
+from nma.render.textures import bitmap_texture, procedural_textures  # noqa: E402
 
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
 

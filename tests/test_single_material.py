@@ -18,7 +18,7 @@ from nma.errors import ParamError, WeightsError
 from nma.images.io import read_image
 from nma.params import MEASURED
 from nma.render.load import SceneError, load_dict, material_bsdf
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 GOLD = materials.load("gold-red-lacquer")

@@ -24,8 +24,7 @@ from nma.images.sheet import Row, contact_sheet
 from nma.render.demo import DEPTH, FLIP_SCALE, TEXTURE_SCALE
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
 from nma.render.progressive import render_passes
-from nma.render.scene import bitmap_texture
-from nma.render.textures import procedural_textures
+from nma.render.textures import bitmap_texture, procedural_textures
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common

@@ -12,7 +12,7 @@ from nma.errors import ParamError, TextureError
 from nma.ops import Float, select
 from nma.params import MEASURED, Bounds, Param, ParamSpace
 from nma.render.input_checks import CHANNELS, Allowed, check_numbers, check_texture
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 
 
 class Inputs:

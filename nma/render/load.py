@@ -12,7 +12,7 @@ from nma.errors import NmaError, ParamError, one_line
 from nma.images.io import check_size
 from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
-from nma.render.scene import bitmap_texture
+from nma.render.textures import bitmap_texture
 
 # How the names of images end that Mitsuba reads.
 _IMAGES = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")

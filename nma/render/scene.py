@@ -23,6 +23,7 @@ from nma.render import lighting as lights
 from nma.render.lighting import smoothstep
 from nma.render.mesh import mesh_shape, needs_coordinates
 from nma.render.shaderball import shader_ball_file
+from nma.render.textures import bitmap_texture
 
 
 class Camera(NamedTuple):
@@ -147,23 +148,6 @@ def material_mask(
 def material_coverage(size: tuple[int, int] = (256, 256), camera: str | Camera | None = None) -> float:
     """Share of the pixels, 0 to 1, whose camera ray meets the material first."""
     return float(material_mask(size, camera).mean())
-
-
-def bitmap_texture(values: NDArray[np.floating], *, scale: float = 1.0) -> dict[str, Any]:
-    """A Mitsuba `bitmap` dictionary around an array, without any colour conversion.
-
-    Args:
-        values: (height, width) or (height, width, 3), linear.
-        scale: how often the texture repeats per unit of uv.
-    """
-    import mitsuba as mi
-
-    texture: dict[str, Any] = {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(np.ascontiguousarray(values, dtype=np.float32)),
-    }
-    texture |= {"raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
-    return texture | {"to_uv": mi.ScalarTransform4f().scale([scale, scale, 1.0])}
 
 
 def _subject(bsdf: Mapping[str, Any], mesh: str | Path | None, up: str) -> dict[str, Any]:

@@ -1,10 +1,12 @@
-"""Textures made by code for examples: worn metal, patches of lacquer, marbled pigment. They tile; a seed fixes them.
+"""Arrays as textures for Mitsuba, and textures made by code: worn metal, patches of lacquer, marbled pigment.
 
-The values are linear source parameters, not colours on a screen: load them as raw data, as
-`nma.render.scene.bitmap_texture` does.
+The values are linear source parameters, not colours on a screen: `bitmap_texture` loads them as raw data. Those made by
+code tile, and a seed fixes them.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,3 +138,20 @@ def _marble(rng: np.random.Generator, size: int) -> Array:
     colour = (1.0 - edge) * LACQUER[band] + edge * LACQUER[(band + 1) % len(LACQUER)]
     grain = 1.0 + 0.05 * periodic_noise(rng, size, period=0.05, slope=1.5)[..., None]
     return np.clip(colour * grain, 0.0, 1.0)
+
+
+def bitmap_texture(values: NDArray[np.floating], *, scale: float = 1.0) -> dict[str, Any]:
+    """A Mitsuba `bitmap` dictionary around an array, without any colour conversion.
+
+    Args:
+        values: (height, width) or (height, width, 3), linear.
+        scale: how often the texture repeats per unit of uv.
+    """
+    import mitsuba as mi
+
+    texture: dict[str, Any] = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(values, dtype=np.float32)),
+    }
+    texture |= {"raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
+    return texture | {"to_uv": mi.ScalarTransform4f().scale([scale, scale, 1.0])}
