@@ -26,6 +26,7 @@ lint:
 	@tools/setup.sh test
 	$(BIN)/ruff check --quiet .
 	$(BIN)/ruff format --quiet --check .
+	@told=$$($(BIN)/lint-imports --no-cache --no-logo) || { echo "$$told"; exit 1; }
 	git ls-files '*.h' '*.cpp' '*.inl' '*.c' | xargs $(BIN)/clang-format --dry-run --Werror
 
 figures:
