@@ -1,0 +1,93 @@
+"""The rooms of the package: their imports go downwards, and the committed drawing shows them."""
+
+import re
+
+import pytest
+
+from tools import rooms
+from tools.layout import crossings, layout
+from tools.map import OUT, WAY, drawing, listing, plan
+
+MOST_ROOMS, MOST_FLOORS = 30, 10
+
+
+def test_every_import_goes_to_a_lower_floor():
+    level = {room: number for number, floor in enumerate(rooms.floors()) for room in floor}
+    assert not {(a, b) for a, b in rooms.imports() if level[a] >= level[b]}
+    assert not rooms.circle(rooms.imports())
+
+
+def test_rooms_and_floors_are_few_enough_to_remember():
+    floors = rooms.floors()
+    listed = [room for floor in floors for room in floor]
+    assert sorted(listed) == sorted({room for arrow in rooms.imports() for room in arrow})
+    assert len(listed) <= MOST_ROOMS
+    assert len(floors) <= MOST_FLOORS
+
+
+def test_the_committed_drawing_is_that_of_the_imports():
+    assert OUT.read_text() == drawing(), (
+        "the rooms have changed: run `python -m tools.map`, and look at the drawing"
+    )
+
+
+def test_the_drawing_has_every_room_and_every_arrow():
+    text, arrows = drawing(), rooms.reduced(rooms.imports())
+    assert text.count('<path class="import"') == len(arrows) + 1  # and one in the legend
+    assert text.count('<path class="way"') == len(WAY) + 1
+    names = re.findall(r'class="name"[^>]*>([^<]+)<', text)
+    assert sorted(names) == sorted(room for floor in plan().floors for room in floor)
+
+
+def test_the_listing_says_what_each_room_is():
+    lines = listing().splitlines()
+    assert [line.split()[1] for line in lines] == [room for floor in rooms.floors() for room in floor]
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+def test_arrows_that_a_longer_way_goes_are_left_out():
+    arrows = frozenset([("cli", "table"), ("table", "params"), ("cli", "params"), ("cli", "errors")])
+    assert rooms.reduced(arrows) == arrows - {("cli", "params")}
+
+
+def test_circles_are_found():
+    way = frozenset([("cli", "table"), ("table", "params")])
+    assert not rooms.circle(way)
+    assert rooms.circle(way | {("params", "table")}) == ["cli", "params", "table"]
+
+
+def test_a_room_is_told_by_as_many_clauses_as_fit(tmp_path, monkeypatch):
+    monkeypatch.setattr(rooms, "ROOT", tmp_path)
+    (tmp_path / rooms.PACKAGE).mkdir()
+    (tmp_path / rooms.PACKAGE / "attic.py").write_text(
+        '"""Old things: chairs,\ntables (some broken). More."""'
+    )
+    assert rooms.summary("attic") == "Old things: chairs, tables (some broken)"
+    assert rooms.summary("attic", lambda text: len(text) < 30) == "Old things: chairs, tables"
+    assert rooms.summary("attic", lambda text: False) == "Old things"
+
+
+@pytest.fixture
+def ladder():
+    """Boxes whose order on the lower floor is the reverse of what suits their arrows; one passes a floor."""
+    floors = [["a", "b", "c"], ["z", "y", "x"], ["end"]]
+    return floors, [("a", "x"), ("b", "y"), ("c", "z"), ("a", "end"), ("z", "end")]
+
+
+def test_boxes_are_ordered_so_that_arrows_do_not_cross(ladder):
+    placed = layout(*ladder, box=10.0, passage=2.0)
+    top, middle, bottom = ladder[0]
+    rows = [sorted(row, key=placed.x.__getitem__) for row in (top, [*middle, ("a", "end", 1)], bottom)]
+    links = [link for way in placed.ways.values() for link in zip(way, way[1:], strict=False)]
+    assert crossings(rows, links) == 0
+
+
+def test_boxes_keep_their_distance(ladder):
+    placed = layout(*ladder, box=10.0, passage=2.0)
+    for floor in ladder[0]:
+        ends = sorted(placed.x[box] for box in floor)
+        assert all(b - a >= 10.0 - 1e-9 for a, b in zip(ends, ends[1:], strict=False))
+
+
+def test_places_are_the_same_each_time(ladder):
+    assert layout(*ladder, box=10.0, passage=2.0) == layout(*ladder, box=10.0, passage=2.0)

@@ -1,0 +1,134 @@
+"""Places boxes on floors, so that arrows between them cross seldom and run straight.
+
+The method is Sugiyama, Tagawa and Toda 1981: an arrow that passes a floor gets a place of its own there, floors are
+ordered by the means of their neighbours, and then moved as close to these means as their order allows.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+Arrow = tuple[str, str]
+Place = str | tuple[str, str, int]  # a box, or where an arrow passes a floor
+
+TRIES, SWEEPS = 60, 16
+# How much straighter arrows are to be where they pass floors than where they meet boxes.
+STRAIGHT = 6.0
+
+
+class Layout(NamedTuple):
+    """Where the boxes' centres are, and the places that arrows pass, from their upper to their lower end."""
+
+    x: dict[Place, float]
+    ways: dict[Arrow, list[Place]]
+
+
+def layout(floors: Sequence[Sequence[str]], arrows: Sequence[Arrow], box: float, passage: float) -> Layout:
+    """Places the boxes of `floors`, highest first.
+
+    Args:
+        arrows: pairs of a box and one on a lower floor.
+        box, passage: widths of a box and of an arrow that passes a floor, with the space around them.
+    """
+    rows, ways = _with_passages(floors, arrows)
+    links = [link for way in ways.values() for link in pairwise(way)]
+    rows = _ordered(rows, links)
+    return Layout(_placed(rows, links, box, passage), ways)
+
+
+def _with_passages(
+    floors: Sequence[Sequence[str]], arrows: Sequence[Arrow]
+) -> tuple[list[list[Place]], dict[Arrow, list[Place]]]:
+    rows: list[list[Place]] = [list(floor) for floor in floors]
+    floor_of = {box: number for number, floor in enumerate(floors) for box in floor}
+    ways: dict[Arrow, list[Place]] = {}
+    for upper, lower in sorted(arrows):
+        passed: list[Place] = [(upper, lower, n) for n in range(floor_of[upper] + 1, floor_of[lower])]
+        for place, row in zip(passed, rows[floor_of[upper] + 1 :], strict=False):
+            row.append(place)
+        ways[upper, lower] = [upper, *passed, lower]
+    return rows, ways
+
+
+def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> list[list[Place]]:
+    """The order with the fewest crossings of several tries."""
+    dice = random.Random(0)
+    best, fewest = rows, float("inf")
+    for _ in range(TRIES):
+        tried = [dice.sample(row, len(row)) for row in rows]
+        for sweep in range(SWEEPS):
+            _sort(tried, links, down=sweep % 2 == 0)
+            crossed = crossings(tried, links)
+            if crossed < fewest:
+                best, fewest = [list(row) for row in tried], crossed
+    return best
+
+
+def _sort(rows: list[list[Place]], links: Sequence[tuple[Place, Place]], down: bool) -> None:
+    """Sorts floors by the mean places of their neighbours on the floor before, from one end to the other."""
+    for n in range(1, len(rows)) if down else range(len(rows) - 2, -1, -1):
+        before = {place: k for k, place in enumerate(rows[n - 1 if down else n + 1])}
+        found: dict[Place, list[int]] = {}
+        for upper, lower in links:
+            here, there = (lower, upper) if down else (upper, lower)
+            if there in before:
+                found.setdefault(here, []).append(before[there])
+        scale = len(before) / len(rows[n])
+        means = {
+            place: sum(found[place]) / len(found[place]) if place in found else k * scale
+            for k, place in enumerate(rows[n])
+        }
+        rows[n].sort(key=means.__getitem__)
+
+
+def crossings(rows: Sequence[Sequence[Place]], links: Sequence[tuple[Place, Place]]) -> int:
+    """How often links between neighbouring floors cross."""
+    count = 0
+    for upper, lower in pairwise(rows):
+        above, below = ({place: k for k, place in enumerate(row)} for row in (upper, lower))
+        ends = [(above[a], below[b]) for a, b in links if a in above]
+        count += sum((a - c) * (b - d) < 0 for k, (a, b) in enumerate(ends) for c, d in ends[:k])
+    return count
+
+
+def _placed(
+    rows: Sequence[Sequence[Place]], links: Sequence[tuple[Place, Place]], box: float, passage: float
+) -> dict[Place, float]:
+    width = lambda place: box if isinstance(place, str) else passage
+    pulls: dict[Place, list[tuple[Place, float]]] = {}
+    for a, b in links:
+        pull = STRAIGHT ** (isinstance(a, tuple) + isinstance(b, tuple))
+        pulls.setdefault(a, []).append((b, pull))
+        pulls.setdefault(b, []).append((a, pull))
+    x: dict[Place, float] = {}
+    offsets = []
+    for row in rows:
+        ends = [width(row[0]) / 2.0]
+        for a, b in pairwise(row):
+            ends.append(ends[-1] + (width(a) + width(b)) / 2.0)
+        offsets.append(ends)
+        x |= {place: end - ends[-1] / 2.0 for place, end in zip(row, ends, strict=True)}
+    for sweep in range(200):
+        for n in range(len(rows))[:: 1 if sweep % 2 else -1]:
+            wanted, weights = [], []
+            for place, offset in zip(rows[n], offsets[n], strict=True):
+                near = pulls.get(place, [(place, 1.0)])
+                weights.append(sum(pull for _, pull in near))
+                wanted.append(sum(x[other] * pull for other, pull in near) / weights[-1] - offset)
+            moved = _rising(wanted, weights)
+            x |= {p: m + o for p, m, o in zip(rows[n], moved, offsets[n], strict=True)}
+    return x
+
+
+def _rising(values: Sequence[float], weights: Sequence[float]) -> list[float]:
+    """The numbers nearest to `values` that never fall: neighbours that do are merged to their mean."""
+    merged: list[tuple[float, float, int]] = []
+    for value, weight in zip(values, weights, strict=True):
+        merged.append((value, weight, 1))
+        while len(merged) > 1 and merged[-2][0] > merged[-1][0]:
+            (a, u, m), (b, v, n) = merged[-2:]
+            merged[-2:] = [((a * u + b * v) / (u + v), u + v, m + n)]
+    return [value for value, _, count in merged for _ in range(count)]

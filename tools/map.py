@@ -1,0 +1,249 @@
+"""Draws the rooms of the package, what they import, and the way of the data through them.
+
+    python -m tools.map [OUT.svg]     draws docs/images/architecture.svg and lists the rooms
+
+Floors are those of the contract in pyproject.toml, arrows are read from the code. An import that a longer way of
+imports implies is left out.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from collections.abc import Sequence
+from html import escape
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from tools import rooms
+from tools.layout import Arrow, Layout, Place, layout
+
+OUT = Path(__file__).parents[1] / "docs/images/architecture.svg"
+# What lies beside the package: name, what it is, and a room on whose floor it is drawn.
+OUTSIDE = ("runtime/", "The adapter in C++, for any renderer", "render")
+
+
+class Step(NamedTuple):
+    """A step on the way of the data."""
+
+    start: str
+    end: str
+    what: str
+
+
+WAY = (
+    Step("params", "sources", "the parameters of a class"),
+    Step("sources", "table", "walks through a material, or its known values"),
+    Step("table", "train", "tables: binned values, with their noise"),
+    Step("train", "adapter", "weights, a file that says all that is needed to use them"),
+    Step("adapter", "render", "the blend at a point, for Mitsuba"),
+    Step("adapter", OUTSIDE[0], "the same weights, for C++"),
+    Step("target", "export", "the analytic BRDF, as syntax trees"),
+    Step("export", OUTSIDE[0], "the same, printed as C++"),
+)
+
+BOX, HEIGHT, GAP, RISE, PASSAGE, PORT = 210, 94, 14, 58, 16, 13  # px
+MARGIN, LABEL = 18, 20
+LETTERS, LINES = 26, 4  # of what a room is
+STYLE = """\
+text { font-family: "Helvetica Neue", Helvetica, Arial, "DejaVu Sans", sans-serif; fill: #23303d }
+.name { font-family: Menlo, Consolas, "DejaVu Sans Mono", monospace; font-weight: bold; font-size: 16px }
+.what { font-size: 12.5px; fill: #52606d }
+.legend { font-size: 14px }
+.floor { font-size: 12px; fill: #9aa5b1 }
+.number { font-size: 12px; font-weight: bold; fill: #ffffff; text-anchor: middle }
+.room { fill: #ffffff; stroke: #7b8794; stroke-width: 1.2 }
+.on-way { fill: #fff3e6; stroke: #d9782d; stroke-width: 1.6 }
+.outside { stroke-dasharray: 5 4 }
+.band { fill: #f4f6f8 }
+.import { fill: none; stroke: #7b8794; stroke-width: 1.2; marker-end: url(#head) }
+.way { fill: none; stroke: #f5a65b; stroke-width: 6; stroke-opacity: .75; marker-end: url(#way-head) }
+.step { fill: #c65d12 }"""
+MARKERS = """\
+<marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" orient="auto-start-reverse" \
+markerUnits="userSpaceOnUse"><path d="M0 0.8 8 4 0 7.2z" fill="#7b8794"/></marker>
+<marker id="way-head" viewBox="0 0 10 10" refX="6" refY="5" markerWidth="18" markerHeight="16" \
+orient="auto-start-reverse" markerUnits="userSpaceOnUse"><path d="M0 0 10 5 0 10z" fill="#e8893a"/></marker>"""
+
+
+def main() -> None:
+    out = Path(sys.argv[1]) if len(sys.argv) > 1 else OUT
+    out.write_text(drawing())
+    print(listing())
+    print(out)
+
+
+def listing() -> str:
+    """The rooms, floor by floor, highest first."""
+    lines = []
+    for number, floor in reversed(list(enumerate(reversed(rooms.floors()), start=1))):
+        lines += [f"{number}  {room:11} {rooms.summary(room)}" for room in floor]
+    return "\n".join(lines)
+
+
+class Plan(NamedTuple):
+    """Where everything lies. Floor 0 is the highest."""
+
+    floors: list[list[str]]
+    imports: frozenset[Arrow]
+    steps: dict[Arrow, Step]  # by their upper and lower room
+    layout: Layout
+    ports: dict[tuple[Arrow, str], float]  # where an arrow meets a box, from the box's centre
+    left: float
+
+    def x(self, place: Place) -> float:
+        return self.layout.x[place] - self.left
+
+    def level(self, box: str) -> int:
+        return next(n for n, floor in enumerate(self.floors) if box in floor)
+
+    @property
+    def width(self) -> int:
+        return round(max(map(self.x, self.layout.x)) + BOX / 2 + 2 * MARGIN)
+
+
+def plan() -> Plan:
+    name, _, neighbour = OUTSIDE
+    floors = [[*floor, name] if neighbour in floor else [*floor] for floor in rooms.floors()]
+    level = {box: n for n, floor in enumerate(floors) for box in floor}
+    steps = {(a, b) if level[a] < level[b] else (b, a): step for step in WAY for a, b in [step[:2]]}
+    _check_way(rooms.imports())
+    imports = rooms.reduced(rooms.imports())
+    arrows = sorted(imports | set(steps))
+    placed = layout(floors, arrows, BOX + GAP, PASSAGE)
+    left = min(placed.x[box] for box in level) - BOX / 2 - 2 * MARGIN - LABEL
+    return Plan(floors, imports, steps, placed, _ports(placed, arrows), left)
+
+
+def _check_way(imports: frozenset[Arrow]) -> None:
+    """Data goes from one room of the package to another where one of them imports the other."""
+    for step in WAY:
+        ends = {(step.start, step.end), (step.end, step.start)}
+        if step.end != OUTSIDE[0] and not ends & imports:
+            sys.exit(f"{step.start} and {step.end} do not import each other; mend WAY in {__file__}")
+
+
+def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], float]:
+    """Spreads the arrows at a side of a box in the order of where they go."""
+    sides: dict[tuple[str, bool], list[tuple[float, Arrow]]] = {}
+    for arrow in arrows:
+        way = placed.ways[arrow]
+        sides.setdefault((arrow[0], True), []).append((placed.x[way[1]], arrow))
+        sides.setdefault((arrow[1], False), []).append((placed.x[way[-2]], arrow))
+    return {
+        (arrow, box): PORT * (k - (len(side) - 1) / 2)
+        for (box, _), side in sides.items()
+        for k, (_, arrow) in enumerate(sorted(side))
+    }
+
+
+def drawing() -> str:
+    """The drawing, as SVG."""
+    p = plan()
+    height = _top(len(p.floors)) + 22 * (len(WAY) + 2)
+    size = f'width="{p.width}" height="{height}"'
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {p.width} {height}" {size}>',
+        "<!-- Drawn by `python -m tools.map`; do not edit. -->",
+        f"<title>The rooms of {rooms.PACKAGE}, what they import, and the way of the data</title>",
+        f"<style>\n{STYLE}\n</style>\n<defs>\n{MARKERS}\n</defs>",
+        f'<rect {size} rx="8" fill="#ffffff"/>',
+        *_bands(p),
+        *(_arrow(p, "way", arrow, upwards=arrow[1] == step.start) for arrow, step in p.steps.items()),
+        *(_arrow(p, "import", arrow) for arrow in sorted(p.imports)),
+        *(_box(p, box) for floor in p.floors for box in sorted(floor, key=p.x)),
+        *(_number(n, *_middle(p, arrow)) for n, arrow in enumerate(p.steps, start=1)),
+        *_legend(p),
+        "</svg>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _top(level: int) -> int:
+    """Where the boxes of a floor begin."""
+    return MARGIN + 8 + level * (HEIGHT + RISE)
+
+
+def _bands(p: Plan) -> list[str]:
+    """A stripe behind each floor, with its number."""
+    parts = []
+    for level in range(len(p.floors)):
+        top, width = _top(level) - 8, p.width - 2 * MARGIN
+        parts += [
+            f'<rect class="band" x="{MARGIN}" y="{top}" width="{width}" height="{HEIGHT + 16}" rx="6"/>',
+            f'<text class="floor" x="{MARGIN + 8}" y="{top + 20}">{len(p.floors) - level}</text>',
+        ]
+    return parts
+
+
+def _box(p: Plan, box: str) -> str:
+    left, top = round(p.x(box) - BOX / 2), _top(p.level(box))
+    outside = box == OUTSIDE[0]
+    kinds = ["room", *["outside"] * outside, *["on-way"] * any(box in arrow for arrow in p.steps)]
+    what = OUTSIDE[1] if outside else rooms.summary(box, lambda text: len(_lines(text)) <= LINES)
+    lines = [
+        f'<text class="what" x="{left + 12}" y="{top + 39 + 15 * n}">{escape(line)}</text>'
+        for n, line in enumerate(_lines(what))
+    ]
+    frame = f'<rect class="{" ".join(kinds)}" x="{left}" y="{top}" width="{BOX}" height="{HEIGHT}" rx="7"/>'
+    name = f'<text class="name" x="{left + 12}" y="{top + 21}">{escape(box)}</text>'
+    return "\n".join([frame, name, *lines])
+
+
+def _lines(text: str) -> list[str]:
+    return textwrap.wrap(text, LETTERS)
+
+
+def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
+    """A line between two boxes, straight where it passes a floor."""
+    points = _points(p, arrow)
+    if upwards:
+        points.reverse()
+    path = f"M{points[0][0]} {points[0][1]}"
+    for (x0, y0), (x1, y1) in pairwise(points):
+        half = (y0 + y1) // 2
+        path += f"V{y1}" if x0 == x1 else f"C{x0} {half} {x1} {half} {x1} {y1}"
+    return f'<path class="{kind}" d="{path}"/>'
+
+
+def _points(p: Plan, arrow: Arrow) -> list[tuple[int, int]]:
+    """Where an arrow leaves the upper box, enters and leaves the floors that it passes, and meets the lower box."""
+    upper, lower = arrow
+    level = p.level(upper)
+    points = [(p.x(upper) + p.ports[arrow, upper], _top(level) + HEIGHT)]
+    for n, place in enumerate(p.layout.ways[arrow][1:-1], start=level + 1):
+        points += [(p.x(place), _top(n)), (p.x(place), _top(n) + HEIGHT)]
+    points.append((p.x(lower) + p.ports[arrow, lower], _top(p.level(lower))))
+    return [(round(x), y) for x, y in points]
+
+
+def _middle(p: Plan, arrow: Arrow) -> tuple[int, int]:
+    (x0, y0), (x1, y1) = _points(p, arrow)[:2]
+    return (x0 + x1) // 2, (y0 + y1) // 2
+
+
+def _number(number: int, x: int, y: int) -> str:
+    circle = f'<circle class="step" cx="{x}" cy="{y}" r="9"/>'
+    return f'{circle}\n<text class="number" x="{x}" y="{y + 4}">{number}</text>'
+
+
+def _legend(p: Plan) -> list[str]:
+    """What the arrows mean, and the steps of the data."""
+    left, top = MARGIN + 12, _top(len(p.floors)) + 4
+    told = "A room imports what its thin arrows point to; where a longer way leads there, too, the arrow is left out."
+    parts = [
+        f'<path class="import" d="M{left} {top - 4}h34"/>',
+        f'<text class="legend" x="{left + 46}" y="{top}">{told}</text>',
+        f'<path class="way" d="M{left} {top + 18}h30"/>',
+        f'<text class="legend" x="{left + 46}" y="{top + 22}">The way of the data:</text>',
+    ]
+    for n, step in enumerate(WAY, start=1):
+        y = top + 22 * (n + 1)
+        text = f"{step.start} to {step.end}: {step.what}"
+        parts += [_number(n, left + 15, y - 4), f'<text class="legend" x="{left + 46}" y="{y}">{text}</text>']
+    return parts
+
+
+if __name__ == "__main__":
+    main()

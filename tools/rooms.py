@@ -1,0 +1,83 @@
+"""The rooms of the package, their floors and the imports between them.
+
+A room is a module or a package directly in `nma/`. Its floor stands in pyproject.toml, in the contract that `make lint`
+checks; what it imports is read from the code, within functions and for type checkers, too.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import tomllib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import grimp
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "nma"
+CONTRACT = "floors"
+
+Arrow = tuple[str, str]  # from the room that imports to the one that is imported
+
+
+@cache
+def floors() -> tuple[tuple[str, ...], ...]:
+    """The rooms of each floor, highest first, as the contract has them."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    (contract,) = (found for found in settings["contracts"] if found["id"] == CONTRACT)
+    return tuple(tuple(re.split(r"\s*\|\s*", layer)) for layer in contract["layers"])
+
+
+@cache
+def imports() -> frozenset[Arrow]:
+    """All imports of one room by another. The face of the package, `nma/__init__.py`, is no room."""
+    graph = grimp.build_graph(PACKAGE, cache_dir=None)
+    pairs = {
+        (_room(module), _room(imported))
+        for module in graph.modules
+        for imported in graph.find_modules_directly_imported_by(module)
+    }
+    return frozenset((a, b) for a, b in pairs if a and b and a != b)
+
+
+def _room(module: str) -> str:
+    return (module.split(".") + [""])[1]
+
+
+def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
+    """Without the arrows that a longer way of arrows goes, too. There must be no circle."""
+
+    @cache
+    def below(room: str) -> frozenset[str]:
+        direct = {b for a, b in arrows if a == room}
+        return frozenset(direct.union(*map(below, direct)))
+
+    return frozenset(
+        (a, b)
+        for a, b in arrows
+        if not any(b in below(other) for x, other in arrows if x == a and other != b)
+    )
+
+
+def circle(arrows: frozenset[Arrow]) -> list[str]:
+    """Rooms that import each other in a circle; none if there is no circle."""
+    left = set(arrows)
+    while True:
+        importing = {a for a, _ in left}
+        kept = {(a, b) for a, b in left if b in importing}
+        if kept == left:
+            return sorted({room for arrow in left for room in arrow})
+        left = kept
+
+
+def summary(room: str, fits: Callable[[str], bool] = lambda text: True) -> str:
+    """What a room is: as many clauses of its docstring's first sentence as fit, at least one."""
+    place = ROOT / PACKAGE / room
+    file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+    text = " ".join((ast.get_docstring(ast.parse(file.read_text())) or "").split())
+    sentence = re.split(r"[.:]?$|\.\s", text, maxsplit=1)[0]
+    clauses = list(itertools.accumulate(re.split(r"(?=[:;]\s|\s\()", sentence)))
+    return max([clauses[0], *filter(fits, clauses)], key=len)
