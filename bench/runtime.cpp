@@ -72,7 +72,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
     const std::string label = std::string(nma::name(adapter.instruction_set())) + (options.compact ? " compact" : "");
     const char* set = label.c_str();
     const int stride = adapter.parameter_count();
-    std::vector<nma::Material> materials(QUERIES);
+    std::vector<nma::Brdf> brdfs(QUERIES);
     std::vector<float> outputs(static_cast<std::size_t>(QUERIES) * adapter.output_count());
     report(network, "inputs and network", set, best([&] {
         alignas(64) float raw[nma::WIDEST_LAYER];
@@ -83,7 +83,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
     }));
     report(network, "prepare", set, best([&] {
         for (int q = 0; q < QUERIES; ++q) {
-            const nma::Material made = adapter.prepare(&queries.parameters[q * stride], queries.cosines[q]);
+            const nma::Brdf made = adapter.prepare(&queries.parameters[q * stride], queries.cosines[q]);
             sink = made.blend().weight(0);
         }
     }));
@@ -91,7 +91,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
         adapter.network_outputs_many(QUERIES, queries.parameters.data(), queries.cosines.data(), outputs.data());
     }));
     report(network, "prepare, batch", set, best([&] {
-        adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), materials.data());
+        adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), brdfs.data());
     }));
     if (options.compact || options.set != nma::fastest()) return;
     // What does not depend on the instruction set.
@@ -100,12 +100,12 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
         for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weight(0);
     }));
     report(network, "eval and pdf", "any", best([&] {
-        for (int q = 0; q < QUERIES; ++q) sink = materials[q].eval(queries.wi[q], queries.wo[q]).value.x;
+        for (int q = 0; q < QUERIES; ++q) sink = brdfs[q].eval_pdf(queries.wi[q], queries.wo[q]).value.x;
     }));
     report(network, "sample, eval and pdf", "any", best([&] {
         for (int q = 0; q < QUERIES; ++q) {
             const float* u = &queries.uniform[3 * q];
-            sink = materials[q].sample(queries.wi[q], u[0], u[1], u[2]).value.x;
+            sink = brdfs[q].sample(queries.wi[q], u[0], u[1], u[2]).value.x;
         }
     }));
 }

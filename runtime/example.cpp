@@ -23,11 +23,11 @@ int main(int count, char** words) {
         std::printf("cos(theta_i)   red   green    blue\n");
         for (const float mu : {.1f, .3f, .5f, .7f, .9f}) {
             const nma::Direction wi{std::sqrt(1.0f - mu * mu), 0.0f, mu};
-            const nma::Material material = adapter.prepare(RED_GOLD, mu);
+            const nma::Brdf brdf = adapter.prepare(RED_GOLD, mu);
             constexpr int SAMPLES = 10000;
             nma::Vec3<double> sum{0.0, 0.0, 0.0};
             for (int k = 0; k < SAMPLES; ++k) {
-                const nma::Sampled s = material.sample(wi, uniform(engine), uniform(engine), uniform(engine));
+                const nma::Sampled s = brdf.sample(wi, uniform(engine), uniform(engine), uniform(engine));
                 if (s.pdf > 0.0f)
                     sum = sum + nma::Vec3<double>{s.value.x / s.pdf, s.value.y / s.pdf, s.value.z / s.pdf};
             }

@@ -2,9 +2,9 @@
 //
 //     const nma::Adapter adapter = nma::Adapter::load("layered3-5x64.safetensors");
 //     adapter.clamp(parameters);                                         // or refuse them: adapter.check(parameters)
-//     const nma::Material at_hit = adapter.prepare(parameters, wi);      // once per shading point
-//     const nma::Value v = at_hit.eval(wi, wo);                          // f cos(theta_o) [1/sr] and pdf [1/sr]
-//     const nma::Sampled s = at_hit.sample(wi, u_lobe, u1, u2);
+//     const nma::Brdf brdf = adapter.prepare(parameters, wi);            // once per shading point
+//     const nma::Value v = brdf.eval_pdf(wi, wo);                        // f cos(theta_o) [1/sr] and pdf [1/sr]
+//     const nma::Sampled s = brdf.sample(wi, u_lobe, u1, u2);
 //
 // C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading and
 // making `Curves` allocate and throw `nma::Error`; everything else does neither and is safe to call from many threads
@@ -24,22 +24,26 @@ using Direction = Vec3<float>;
 using Value = Evaluation<float>;
 using Sampled = Sample<float>;
 
-// The material at one shading point, for the cos(theta_i), of anisotropic adapters the `wi`, that it was prepared for.
-class Material {
+// The BRDF at one shading point, for the cos(theta_i), of anisotropic adapters the `wi`, that it was prepared for.
+class Brdf {
 public:
-    // f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both 0 below the horizon.
-    Value eval(const Direction& wi, const Direction& wo) const {
-        const Plane plane = Plane::of(wi, in_plane_);
-        return eval_pdf(blend_, plane.enter(wi), plane.enter(wo));
-    }
+    // f cos(theta_o) [1/sr], 0 below the horizon.
+    Vec3<float> eval(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).value; }
 
-    float pdf(const Direction& wi, const Direction& wo) const { return eval(wi, wo).pdf; }
+    // The density of `sample` [1/sr], 0 below the horizon.
+    float pdf(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).pdf; }
+
+    // Both at the price of one.
+    Value eval_pdf(const Direction& wi, const Direction& wo) const {
+        const Plane<float> plane = frame(wi);
+        return nma::eval_pdf(blend_, plane_enter<float>(plane, wi), plane_enter<float>(plane, wo));
+    }
 
     // A direction from three uniform numbers in [0, 1), with its value and density; pdf == 0 marks an invalid one.
     Sampled sample(const Direction& wi, float u_lobe, float u1, float u2) const {
-        const Plane plane = Plane::of(wi, in_plane_);
-        Sampled found = nma::sample(blend_, plane.enter(wi), u_lobe, u1, u2);
-        found.wo = plane.leave(found.wo);
+        const Plane<float> plane = frame(wi);
+        Sampled found = nma::sample(blend_, plane_enter<float>(plane, wi), u_lobe, u1, u2);
+        found.wo = plane_leave<float>(plane, found.wo);
         return found;
     }
 
@@ -64,25 +68,15 @@ private:
     friend class Adapter;
     friend class Curves;
 
-    // Rotation about z into the frame whose x axis lies in the plane of incidence. Twin of nma/target/plane.py.
-    struct Plane {
-        float cos_phi, sin_phi;
-
-        static Plane of(const Direction& wi, bool wanted) {
-            const float length = std::sqrt(wi.x * wi.x + wi.y * wi.y);
-            return wanted && length > 0.0f ? Plane{wi.x / length, wi.y / length} : Plane{1.0f, 0.0f};
-        }
-        Direction enter(const Direction& v) const {
-            return {cos_phi * v.x + sin_phi * v.y, cos_phi * v.y - sin_phi * v.x, v.z};
-        }
-        Direction leave(const Direction& v) const {
-            return {cos_phi * v.x - sin_phi * v.y, sin_phi * v.x + cos_phi * v.y, v.z};
-        }
-    };
+    // Found anew at each call: a BRDF that was prepared for a cosine alone serves all azimuths.
+    Plane<float> frame(const Direction& wi) const { return in_plane_ ? plane_of<float>(wi) : Plane<float>{1.0f, 0.0f}; }
 
     Blend<float> blend_;
     bool in_plane_ = false;
 };
+
+// What `Brdf` was called before.
+using Material = Brdf;
 
 // How a weights file is loaded.
 struct Options {
@@ -140,34 +134,34 @@ public:
     // for the azimuth 0: wi = (sqrt(1 - c^2), 0, c).
     bool anisotropic() const { return recipe_.encoding.anisotropic(); }
 
-    // The blend for the parameters of the source material, seen from `wi`.
-    Material prepare(const float* parameters, const Direction& wi) const {
-        Material made;
+    // The BRDF for the parameters of the source material, seen from `wi`.
+    Brdf prepare(const float* parameters, const Direction& wi) const {
+        Brdf made;
         made.in_plane_ = in_plane_;
         kernels().prepare(recipe_, parameters, wi, made.blend_);
         return made;
     }
-    Material prepare(const float* parameters, float cos_theta_i) const {
+    Brdf prepare(const float* parameters, float cos_theta_i) const {
         return prepare(parameters, at_azimuth_0(cos_theta_i));
     }
 
     // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
-    void prepare_many(int count, const float* parameters, const Direction* wi, Material* materials) const {
+    void prepare_many(int count, const float* parameters, const Direction* wi, Brdf* brdfs) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
             const int now = std::min(BLOCK, count - first);
             outputs_of_block(now, row(parameters, first), wi + first, outputs);
             for (int q = 0; q < now; ++q) {
-                Material& made = materials[first + q];
+                Brdf& made = brdfs[first + q];
                 made.in_plane_ = in_plane_;
                 kernels().decode(recipe_, outputs + q * network_.output_stride(), wi[first + q].z, made.blend_);
             }
-            for (int q = first; q < first + now; ++q) kernels().odds(recipe_, wi[q].z, materials[q].blend_);
+            for (int q = first; q < first + now; ++q) kernels().odds(recipe_, wi[q].z, brdfs[q].blend_);
         }
     }
-    void prepare_many(int count, const float* parameters, const float* cos_theta_i, Material* materials) const {
+    void prepare_many(int count, const float* parameters, const float* cos_theta_i, Brdf* brdfs) const {
         in_blocks(count, cos_theta_i, [&](int first, int now, const Direction* wi) {
-            prepare_many(now, row(parameters, first), wi, materials + first);
+            prepare_many(now, row(parameters, first), wi, brdfs + first);
         });
     }
 
@@ -351,13 +345,13 @@ public:
     }
 
     // Weights and odds of both neighbours sum to one, and so do those between them.
-    Material at(float cos_theta_i) const {
+    Brdf at(float cos_theta_i) const {
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
         const Lanes<float> t = position - static_cast<float>(left);
         const Blend<float>& a = nodes_[left].blend_;
         const Blend<float>& b = nodes_[left + 1].blend_;
-        Material made;
+        Brdf made;
         made.in_plane_ = nodes_[left].in_plane_;
         made.blend_.count = a.count;
         made.blend_.scale = a.scale + (b.scale - a.scale) * t[0];
@@ -372,15 +366,15 @@ public:
     }
 
 private:
-    std::vector<Material> nodes_;
+    std::vector<Brdf> nodes_;
 };
 
-// Batches of `Material::eval` and `Material::sample`; `u` holds three uniform numbers for each.
-inline void eval_many(int count, const Material* materials, const Direction* wi, const Direction* wo, Value* values) {
-    for (int k = 0; k < count; ++k) values[k] = materials[k].eval(wi[k], wo[k]);
+// Batches of `Brdf::eval_pdf` and `Brdf::sample`; `u` holds three uniform numbers for each.
+inline void eval_pdf_many(int count, const Brdf* brdfs, const Direction* wi, const Direction* wo, Value* values) {
+    for (int k = 0; k < count; ++k) values[k] = brdfs[k].eval_pdf(wi[k], wo[k]);
 }
-inline void sample_many(int count, const Material* materials, const Direction* wi, const float* u, Sampled* samples) {
-    for (int k = 0; k < count; ++k, u += 3) samples[k] = materials[k].sample(wi[k], u[0], u[1], u[2]);
+inline void sample_many(int count, const Brdf* brdfs, const Direction* wi, const float* u, Sampled* samples) {
+    for (int k = 0; k < count; ++k, u += 3) samples[k] = brdfs[k].sample(wi[k], u[0], u[1], u[2]);
 }
 
 }  // namespace nma

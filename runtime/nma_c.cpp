@@ -12,15 +12,13 @@ struct nma_curves {
     nma::Curves curves;
 };
 
-static_assert(sizeof(nma::Material) <= sizeof(nma_material) && alignof(nma::Material) <= alignof(nma_material));
-static_assert(std::is_trivially_copyable_v<nma::Material>);
+static_assert(sizeof(nma::Brdf) <= sizeof(nma_brdf) && alignof(nma::Brdf) <= alignof(nma_brdf));
+static_assert(std::is_trivially_copyable_v<nma::Brdf>);
 
 namespace {
 
-const nma::Material& of(const nma_material& material) {
-    return *std::launder(reinterpret_cast<const nma::Material*>(&material));
-}
-void put(nma_material* to, const nma::Material& material) { new (to) nma::Material(material); }
+const nma::Brdf& of(const nma_brdf& brdf) { return *std::launder(reinterpret_cast<const nma::Brdf*>(&brdf)); }
+void put(nma_brdf* to, const nma::Brdf& brdf) { new (to) nma::Brdf(brdf); }
 nma::InstructionSet set_of(int number) { return static_cast<nma::InstructionSet>(number - NMA_PORTABLE); }
 nma::Direction direction(const float* v) { return {v[0], v[1], v[2]}; }
 
@@ -32,13 +30,13 @@ void in_blocks(int count, F work) {
     for (int first = 0; first < count; first += BLOCK) work(static_cast<size_t>(first), std::min(BLOCK, count - first));
 }
 
-// At most BLOCK materials, for cosines or directions.
+// At most BLOCK of them, for cosines or directions.
 template <class View>
 void prepare_block(const nma::Adapter& adapter, int count, const float* parameters, const View* views,
-                   nma_material* materials) {
-    nma::Material block[BLOCK];
+                   nma_brdf* brdfs) {
+    nma::Brdf block[BLOCK];
     adapter.prepare_many(count, parameters, views, block);
-    for (int k = 0; k < count; ++k) put(materials + k, block[k]);
+    for (int k = 0; k < count; ++k) put(brdfs + k, block[k]);
 }
 
 // At most BLOCK directions from their rows.
@@ -74,6 +72,8 @@ nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
 
 }  // namespace
 
+size_t nma_brdf_size(void) { return sizeof(nma_brdf); }
+
 int nma_supported(int set) {
     return set == NMA_FASTEST || (set >= NMA_PORTABLE && set <= NMA_AVX512_BF16 && nma::supported(set_of(set)));
 }
@@ -106,27 +106,27 @@ int nma_output_count(const nma_adapter* a) { return a->adapter.output_count(); }
 int nma_instruction_set(const nma_adapter* a) { return static_cast<int>(a->adapter.instruction_set()) + NMA_PORTABLE; }
 int nma_anisotropic(const nma_adapter* a) { return a->adapter.anisotropic(); }
 
-void nma_prepare(const nma_adapter* a, const float* parameters, float cos_theta_i, nma_material* material) {
-    put(material, a->adapter.prepare(parameters, cos_theta_i));
+void nma_prepare(const nma_adapter* a, const float* parameters, float cos_theta_i, nma_brdf* brdf) {
+    put(brdf, a->adapter.prepare(parameters, cos_theta_i));
 }
 
 void nma_prepare_many(const nma_adapter* a, int count, const float* parameters, const float* cos_theta_i,
-                      nma_material* materials) {
+                      nma_brdf* brdfs) {
     in_blocks(count, [&](size_t first, int now) {
         prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), cos_theta_i + first,
-                      materials + first);
+                      brdfs + first);
     });
 }
 
-void nma_prepare_direction(const nma_adapter* a, const float* parameters, const float* wi, nma_material* material) {
-    put(material, a->adapter.prepare(parameters, direction(wi)));
+void nma_prepare_direction(const nma_adapter* a, const float* parameters, const float* wi, nma_brdf* brdf) {
+    put(brdf, a->adapter.prepare(parameters, direction(wi)));
 }
 
 void nma_prepare_direction_many(const nma_adapter* a, int count, const float* parameters, const float* wi,
-                                nma_material* materials) {
+                                nma_brdf* brdfs) {
     in_blocks(count, [&](size_t first, int now) {
         const Directions rows(now, wi + 3 * first);
-        prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), rows.wi, materials + first);
+        prepare_block(a->adapter, now, parameters + first * a->adapter.parameter_count(), rows.wi, brdfs + first);
     });
 }
 
@@ -151,30 +151,30 @@ nma_curves* nma_curves_new(const nma_adapter* a, const float* parameters) {
         return nullptr;
     }
 }
-void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material) {
-    put(material, curves->curves.at(cos_theta_i));
+void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_brdf* brdf) {
+    put(brdf, curves->curves.at(cos_theta_i));
 }
 void nma_curves_free(nma_curves* curves) { delete curves; }
 
-void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* out) {
+void nma_eval_pdf(int count, const nma_brdf* brdfs, const float* wi, const float* wo, float* out) {
     for (int k = 0; k < count; ++k, wi += 3, wo += 3, out += 4) {
-        const nma::Value e = of(materials[k]).eval(direction(wi), direction(wo));
+        const nma::Value e = of(brdfs[k]).eval_pdf(direction(wi), direction(wo));
         const float row[] = {e.value.x, e.value.y, e.value.z, e.pdf};
         std::copy_n(row, 4, out);
     }
 }
 
-void nma_sample(int count, const nma_material* materials, const float* wi, const float* u, float* out) {
+void nma_sample(int count, const nma_brdf* brdfs, const float* wi, const float* u, float* out) {
     for (int k = 0; k < count; ++k, wi += 3, u += 3, out += 7) {
-        const nma::Sampled s = of(materials[k]).sample(direction(wi), u[0], u[1], u[2]);
+        const nma::Sampled s = of(brdfs[k]).sample(direction(wi), u[0], u[1], u[2]);
         const float row[] = {s.wo.x, s.wo.y, s.wo.z, s.value.x, s.value.y, s.value.z, s.pdf};
         std::copy_n(row, 7, out);
     }
 }
 
-void nma_albedo(int count, const nma_material* materials, const float* wi, float* out) {
+void nma_albedo(int count, const nma_brdf* brdfs, const float* wi, float* out) {
     for (int k = 0; k < count; ++k, wi += 3, out += 3) {
-        const nma::Vec3<float> albedo = of(materials[k]).albedo(direction(wi));
+        const nma::Vec3<float> albedo = of(brdfs[k]).albedo(direction(wi));
         std::copy_n(&albedo.x, 3, out);
     }
 }

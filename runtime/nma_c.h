@@ -29,10 +29,14 @@ typedef struct nma_curves nma_curves;
 #define NMA_ALIGNED __attribute__((aligned(16)))
 #endif
 
-/* A material at one shading point, on a boundary of 16 bytes. */
+/* A BRDF at one shading point, on a boundary of 16 bytes. */
 typedef struct {
     NMA_ALIGNED float opaque[168];
-} nma_material;
+} nma_brdf;
+/* What it was called before. */
+typedef nma_brdf nma_material;
+/* The bytes of one, for languages that do not read this header. */
+NMA_C_API size_t nma_brdf_size(void);
 
 /* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to
  * one to have weights rounded to bfloat16: nma::Options. */
@@ -60,16 +64,15 @@ NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
 /* Whether the view's azimuth matters. Cosines alone stand for the azimuth 0 then: give directions. */
 NMA_C_API int nma_anisotropic(const nma_adapter* adapter);
 
-NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i,
-                           nma_material* material);
+NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i, nma_brdf* brdf);
 NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters,
-                                const float* cos_theta_i, nma_material* materials);
+                                const float* cos_theta_i, nma_brdf* brdfs);
 
 /* The same seen from directions, three floats each; of isotropic adapters only their z matters. */
 NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi,
-                                     nma_material* material);
+                                     nma_brdf* brdf);
 NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters,
-                                          const float* wi, nma_material* materials);
+                                          const float* wi, nma_brdf* brdfs);
 
 /* Raw outputs of the network, `nma_output_count` for each query. */
 NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters,
@@ -79,17 +82,16 @@ NMA_C_API void nma_outputs_direction_many(const nma_adapter* adapter, int count,
 
 /* Curves of an untextured material. NULL for an anisotropic adapter, which has none, and where memory is short. */
 NMA_C_API nma_curves* nma_curves_new(const nma_adapter* adapter, const float* parameters);
-NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_material* material);
+NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_brdf* brdf);
 NMA_C_API void nma_curves_free(nma_curves* curves);
 
-/* For each material: `value_pdf` gets f cos(theta_o) [1/sr] as RGB and the density [1/sr]; `wo_value_pdf` a direction
+/* For each BRDF: `value_pdf` gets f cos(theta_o) [1/sr] as RGB and the density [1/sr]; `wo_value_pdf` a direction
  * before them, drawn with three uniform numbers in [0, 1) from `u`. A density of 0 marks an invalid direction. */
-NMA_C_API void nma_eval(int count, const nma_material* materials, const float* wi, const float* wo, float* value_pdf);
-NMA_C_API void nma_sample(int count, const nma_material* materials, const float* wi, const float* u,
-                          float* wo_value_pdf);
+NMA_C_API void nma_eval_pdf(int count, const nma_brdf* brdfs, const float* wi, const float* wo, float* value_pdf);
+NMA_C_API void nma_sample(int count, const nma_brdf* brdfs, const float* wi, const float* u, float* wo_value_pdf);
 
-/* For each material the directional albedo at `wi` as RGB, at most 1, without noise. */
-NMA_C_API void nma_albedo(int count, const nma_material* materials, const float* wi, float* albedo);
+/* For each BRDF the directional albedo at `wi` as RGB, at most 1, without noise. */
+NMA_C_API void nma_albedo(int count, const nma_brdf* brdfs, const float* wi, float* albedo);
 
 #ifdef __cplusplus
 }

@@ -91,13 +91,13 @@ def test_python_reaches_the_batched_kernel(tmp_path):
     materials = runtime.prepare(params, cosines)
     wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
     wo, value, pdf = runtime.sample(materials, wi, rng.random((500, 3)))
-    again, density = runtime.eval(materials, wi, wo)
+    again, density = runtime.eval_pdf(materials, wi, wo)
     np.testing.assert_allclose(again[pdf > 0], value[pdf > 0], rtol=1e-6)
     np.testing.assert_allclose(density[pdf > 0], pdf[pdf > 0], rtol=1e-6)
     # Rows that lie on no boundary of 16 bytes.
     shifted = np.empty(materials.size + 1, np.float32)[1:].reshape(materials.shape)
     shifted[:] = materials
-    np.testing.assert_array_equal(runtime.eval(shifted, wi, wo)[0], again)
+    np.testing.assert_array_equal(runtime.eval_pdf(shifted, wi, wo)[0], again)
 
     with pytest.raises(nma.errors.WeightsError, match="no such weights file"):
         Runtime(tmp_path / "none.safetensors")

@@ -158,7 +158,7 @@ def test_single_queries_and_batches_make_the_same_materials(name):
             loaded._library.nma_prepare(
                 loaded._handle, pointer(numbers), ctypes.c_float(cosine), pointer(material)
             )
-        many, each = (np.column_stack(loaded.eval(materials, wi, wo)) for materials in (many, each))
+        many, each = (np.column_stack(loaded.eval_pdf(materials, wi, wo)) for materials in (many, each))
         tolerance = 1e-2 if instruction_set == "avx512_bf16" else 1e-3
         np.testing.assert_allclose(many, each, rtol=tolerance, atol=1e-5)
 
@@ -170,7 +170,7 @@ def test_an_adapter_evaluates_like_the_package():
     value, pdf = target.eval_pdf(adapter.prepare(list(params.T), wi.T[2]), Vec3(*wi.T), Vec3(*wo.T))
     for instruction_set in in_single_precision():
         loaded = Runtime("layered3-3x32", instruction_set)
-        found = np.column_stack(loaded.eval(loaded.prepare(params, wi.T[2]), wi, wo))
+        found = np.column_stack(loaded.eval_pdf(loaded.prepare(params, wi.T[2]), wi, wo))
         # Errors of the network's outputs, 1e-5, are multiplied by sharp lobes.
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
@@ -190,7 +190,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
     for instruction_set in in_single_precision():
         loaded = Runtime(tmp_path / "single.safetensors", instruction_set)
         assert loaded.parameters == 0
-        found = np.column_stack(loaded.eval(loaded.prepare(np.zeros((CASES, 0)), wi.T[2]), wi, wo))
+        found = np.column_stack(loaded.eval_pdf(loaded.prepare(np.zeros((CASES, 0)), wi.T[2]), wi, wo))
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 
@@ -210,7 +210,7 @@ def test_curves_follow_the_network():
             library.nma_curves_at(curves, ctypes.c_float(cosine), pointer(row))
         library.nma_curves_free(curves)
         wo, _, pdf = loaded.sample(exact, wi, u)
-        a, b = (np.column_stack(loaded.eval(m, wi, wo))[pdf > 0] for m in (followed, exact))
+        a, b = (np.column_stack(loaded.eval_pdf(m, wi, wo))[pdf > 0] for m in (followed, exact))
         error = np.abs(a - b) / (1e-3 + b)
         assert np.median(error) < 5e-4
         assert error.mean() < 5e-3
@@ -226,7 +226,7 @@ def test_samples_have_the_values_and_densities_of_eval():
     valid = pdf > 0
     assert valid.mean() > 0.9
     assert np.abs(np.linalg.norm(wo, axis=1) - 1)[valid].max() < 1e-5
-    again, density = loaded.eval(materials, wi, wo)
+    again, density = loaded.eval_pdf(materials, wi, wo)
     np.testing.assert_allclose(value[valid], again[valid], rtol=1e-6)
     np.testing.assert_allclose(pdf[valid], density[valid], rtol=1e-6)
 
@@ -252,7 +252,7 @@ def test_samples_follow_the_density():
             wo, _, pdf = loaded.sample(*alike(n), rng.random((n, 3), np.float32))
             return wo, pdf
 
-        right, wrong = p_values(sample, lambda wo: loaded.eval(*alike(len(wo)), wo)[1])
+        right, wrong = p_values(sample, lambda wo: loaded.eval_pdf(*alike(len(wo)), wo)[1])
         assert right > 1 - (1 - 1e-3) ** (1 / tests), k
         assert wrong < 1e-6
 

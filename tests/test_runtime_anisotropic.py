@@ -99,7 +99,7 @@ def test_values_densities_and_samples_are_those_of_the_package(case):
     for instruction_set in available():
         runtime = Runtime(path, instruction_set)
         prepared = runtime.prepare(none(), wi)
-        found = np.column_stack(runtime.eval(prepared, wi, wo))
+        found = np.column_stack(runtime.eval_pdf(prepared, wi, wo))
         assert close(found, values, instruction_set) > 0.998
         # Next to the borders of lobes a rounding chooses another one.
         found = np.column_stack(runtime.sample(prepared, wi, u))
@@ -114,7 +114,7 @@ def test_single_queries_and_batches_make_the_same_materials(case):
         each = np.zeros_like(many)
         for material, row in zip(each, wi, strict=True):
             runtime._library.nma_prepare_direction(runtime._handle, None, pointer(row), pointer(material))
-        many, each = (np.column_stack(runtime.eval(m, wi, wo)) for m in (many, each))
+        many, each = (np.column_stack(runtime.eval_pdf(m, wi, wo)) for m in (many, each))
         tolerance = 1e-2 if instruction_set == "avx512_bf16" else 1e-3
         np.testing.assert_allclose(many, each, rtol=tolerance, atol=1e-5)
 
@@ -122,14 +122,16 @@ def test_single_queries_and_batches_make_the_same_materials(case):
 def test_a_cosine_alone_stands_for_azimuth_zero(case):
     runtime = Runtime(case[1])
     cosines = np.random.default_rng(7).uniform(0.02, 1, CASES).astype(np.float32)
-    many, one = np.zeros((CASES, runtime.size), np.float32), np.zeros((1, 168), np.float32)
+    many, one = np.zeros((CASES, runtime.size), np.float32), np.zeros((1, runtime._brdf), np.float32)
     library, handle = runtime._library, runtime._handle
     library.nma_outputs_many(handle, CASES, None, pointer(cosines), pointer(many))
     np.testing.assert_allclose(many, runtime.outputs(none(), facing(cosines)), rtol=1e-4, atol=1e-4)
     library.nma_prepare(handle, None, ctypes.c_float(cosines[0]), pointer(one))
     wi, wo = facing(cosines[:1]), directions(8)[:1]
     again = runtime.prepare(np.zeros((1, 0)), wi)
-    np.testing.assert_allclose(runtime.eval(one, wi, wo)[0], runtime.eval(again, wi, wo)[0], rtol=1e-3)
+    np.testing.assert_allclose(
+        runtime.eval_pdf(one, wi, wo)[0], runtime.eval_pdf(again, wi, wo)[0], rtol=1e-3
+    )
 
 
 def test_isotropic_adapters_read_the_cosine_of_a_direction():
@@ -140,7 +142,9 @@ def test_isotropic_adapters_read_the_cosine_of_a_direction():
         np.testing.assert_array_equal(runtime.outputs(params, wi), runtime.outputs(params, wi[:, 2]))
         by_direction, by_cosine = (runtime.prepare(params, v) for v in (wi, wi[:, 2]))
         wo = directions(10)
-        for a, b in zip(runtime.eval(by_direction, wi, wo), runtime.eval(by_cosine, wi, wo), strict=True):
+        for a, b in zip(
+            runtime.eval_pdf(by_direction, wi, wo), runtime.eval_pdf(by_cosine, wi, wo), strict=True
+        ):
             np.testing.assert_array_equal(a, b)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +17,7 @@ from typing import Any
 
 from nma import microfacet
 from nma.errors import NmaError
-from nma.target import albedo, principled, sampling
+from nma.target import albedo, plane, principled, sampling
 
 STRUCTURES: tuple[type, ...] = (
     principled.Principled,
@@ -24,8 +25,9 @@ STRUCTURES: tuple[type, ...] = (
     principled.Terms,
     principled.Lobes,
     albedo.Albedos,
+    plane.Plane,
 )
-# Callers stand after what they call.
+# Callers stand after what they call. A method `of` of the structure `Plane` becomes the function `plane_of`.
 FUNCTIONS: tuple[Callable, ...] = (
     microfacet.ggx_d,
     microfacet.smith_g1,
@@ -56,6 +58,9 @@ FUNCTIONS: tuple[Callable, ...] = (
     sampling.sample_diffuse,
     sampling.sample_spec,
     sampling.sample_clearcoat,
+    plane.Plane.of,
+    plane.Plane.enter,
+    plane.Plane.leave,
 )
 
 
@@ -119,11 +124,14 @@ def _names(function: Function) -> list[str]:
 def parsed(function: Callable) -> Function:
     """The syntax tree with the line numbers of the file."""
     lines, first = inspect.getsourcelines(function)
-    tree = ast.parse("".join(lines)).body[0]
+    tree = ast.parse(textwrap.dedent("".join(lines))).body[0]
     ast.increment_lineno(tree, first - 1)
     module: Any = inspect.getmodule(function)
     assert isinstance(tree, ast.FunctionDef)
-    arguments = [(a.arg, ast.unparse(a.annotation)) for a in tree.args.args if a.annotation]
+    owner, _, _ = function.__qualname__.rpartition(".")
+    name = f"{owner.lower()}_{tree.name}" if owner else tree.name
+    # `self` has no annotation.
+    arguments = [(a.arg, ast.unparse(a.annotation) if a.annotation else owner) for a in tree.args.args]
     body = tree.body[1:] if ast.get_docstring(tree) else tree.body
     returns = ast.unparse(tree.returns) if tree.returns else ""
-    return Function(tree.name, ast.get_docstring(tree) or "", arguments, returns, body, module)
+    return Function(name, ast.get_docstring(tree) or "", arguments, returns, body, module)

@@ -1,12 +1,12 @@
 """The C++ runtime from Python, for many queries at once: a compiled library, made when it is first wanted.
 
     runtime = nma.native.runtime.Runtime("layered3-5x64")
-    materials = runtime.prepare(params, wi)                    # (n, 13) in the training range, (n, 3)
-    value, pdf = runtime.eval(materials, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
-    wo, value, pdf = runtime.sample(materials, wi, u)
+    brdfs = runtime.prepare(params, wi)                        # (n, 13) in the training range, (n, 3)
+    value, pdf = runtime.eval_pdf(brdfs, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
+    wo, value, pdf = runtime.sample(brdfs, wi, u)
 
-Directions are unit vectors (n, 3) in the local frame, z up, `wi` towards the viewer, of the cosine that the material
-was prepared for; of anisotropic adapters, of the same direction. All arrays become float32.
+Directions are unit vectors (n, 3) in the local frame, z up, `wi` towards the viewer, of the cosine that the BRDF was
+prepared for; of anisotropic adapters, of the same direction. All arrays become float32.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ Array = NDArray[np.float32]
 # As nma_c.h numbers them.
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
-# Floats of an opaque material, and the boundary in bytes that it lies on.
-_MATERIAL, _ALIGNMENT = 168, 16
+# Bytes: the boundary that a BRDF lies on.
+_ALIGNMENT = 16
 _MESSAGE = 500
 
 
@@ -73,6 +73,8 @@ class Runtime:
         if not handle:
             raise WeightsError(message.value.decode())
         self._handle = ctypes.c_void_p(handle)
+        # Floats of an opaque row.
+        self._brdf = self._library.nma_brdf_size() // np.dtype(np.float32).itemsize
         self.parameters = self._library.nma_parameter_count(self._handle)
         self.names = [self._name(k) for k in range(self.parameters)]
         self.low, self.high = self._ranges()
@@ -90,7 +92,7 @@ class Runtime:
         return self._many("nma_outputs", self._checked(params, clamp), wi, self.size)
 
     def prepare(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
-        """Materials for `eval` and `sample`, opaque rows.
+        """BRDFs for `eval_pdf` and `sample`, opaque rows.
 
         Args:
             params: (n, parameters), within the training range.
@@ -102,22 +104,30 @@ class Runtime:
             ParamError: parameters beyond the training range, or not finite; other shapes, different lengths, or cosines
                 for an anisotropic adapter.
         """
-        return self._many("nma_prepare", self._checked(params, clamp), wi, _MATERIAL)
+        return self._many("nma_prepare", self._checked(params, clamp), wi, self._brdf)
 
-    def eval(self, materials: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
-        """f cos(theta_o) [1/sr] (n, 3) and the density of `sample` [1/sr] (n,), both 0 below the horizon."""
-        found = self._each("nma_eval", materials, wi, 4, wo)
+    def eval(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> Array:
+        """f cos(theta_o) [1/sr] (n, 3), 0 below the horizon."""
+        return self.eval_pdf(brdfs, wi, wo)[0]
+
+    def pdf(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> Array:
+        """The density of `sample` [1/sr] (n,), 0 below the horizon."""
+        return self.eval_pdf(brdfs, wi, wo)[1]
+
+    def eval_pdf(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
+        """`eval` (n, 3) and `pdf` (n,) at the price of one."""
+        found = self._each("nma_eval_pdf", brdfs, wi, 4, wo)
         return found[:, :3], found[:, 3]
 
-    def sample(self, materials: Array, wi: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
-        """Directions (n, 3) drawn with uniform numbers (n, 3) in [0, 1), and `eval` of them; a density of 0 marks an
-        invalid one."""
-        found = self._each("nma_sample", materials, wi, 7, u)
+    def sample(self, brdfs: Array, wi: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
+        """Directions (n, 3) drawn with uniform numbers (n, 3) in [0, 1), and `eval_pdf` of them; a density of 0 marks
+        an invalid one."""
+        found = self._each("nma_sample", brdfs, wi, 7, u)
         return found[:, :3], found[:, 3:6], found[:, 6]
 
-    def albedo(self, materials: Array, wi: ArrayLike) -> Array:
+    def albedo(self, brdfs: Array, wi: ArrayLike) -> Array:
         """Directional albedos (n, 3) at `wi`, at most 1: the means over 128 fixed samples each, so without noise."""
-        return self._each("nma_albedo", materials, wi, 3)
+        return self._each("nma_albedo", brdfs, wi, 3)
 
     def _name(self, column: int) -> str:
         return self._library.nma_parameter_name(self._handle, column).decode()
@@ -176,8 +186,8 @@ class Runtime:
             )
         return _rows("wi", wi)
 
-    def _each(self, name: str, materials: Array, wi: ArrayLike, width: int, *more: ArrayLike) -> Array:
-        arrays = [_rows("materials", materials, _MATERIAL), _rows("wi", wi, 3)]
+    def _each(self, name: str, brdfs: Array, wi: ArrayLike, width: int, *more: ArrayLike) -> Array:
+        arrays = [_rows("brdfs", brdfs, self._brdf), _rows("wi", wi, 3)]
         arrays += [_rows("wo or u", rows, 3) for rows in more]
         if len({len(array) for array in arrays}) > 1:
             raise ParamError(f"arrays of different lengths: {', '.join(str(len(a)) for a in arrays)}")
@@ -205,4 +215,5 @@ def _library() -> ctypes.CDLL:
     loaded.nma_load.restype = ctypes.c_void_p
     loaded.nma_load.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t]
     loaded.nma_parameter_name.restype = ctypes.c_char_p
+    loaded.nma_brdf_size.restype = ctypes.c_size_t
     return loaded

@@ -51,9 +51,9 @@ public:
                                                                         const Vector3f& wo, Float u, const Point2f& u2,
                                                                         Mask) const override {
         if (hidden(context, si)) return {0.0f, 0.0f, dr::zeros<BSDFSample3f>(), 0.0f};
-        const nma::Material material = prepare(si);
-        const auto [value, density] = evaluated(context, material, si, wo);
-        const auto [drawn, weight] = sampled(context, material, si, u, u2);
+        const nma::Brdf brdf = prepare(si);
+        const auto [value, density] = evaluated(context, brdf, si, wo);
+        const auto [drawn, weight] = sampled(context, brdf, si, u, u2);
         return {value, density, drawn, weight};
     }
 
@@ -133,7 +133,7 @@ private:
         }
     }
 
-    nma::Material prepare(const SurfaceInteraction3f& si) const {
+    nma::Brdf prepare(const SurfaceInteraction3f& si) const {
         const float cosine = nma::clip(static_cast<float>(si.wi.z()), 1e-4f, 1.0f);
         if (curves_ && inputs_.settled(si)) return curves_->at(cosine);
         float parameters[MOST_PARAMETERS];
@@ -146,15 +146,15 @@ private:
         return prepare(si).albedo(direction(si.wi));
     }
 
-    std::pair<Spectrum, Float> evaluated(const BSDFContext& context, const nma::Material& material,
+    std::pair<Spectrum, Float> evaluated(const BSDFContext& context, const nma::Brdf& brdf,
                                          const SurfaceInteraction3f& si, const Vector3f& wo) const {
-        const nma::Value v = material.eval(direction(si.wi), direction(wo));
+        const nma::Value v = brdf.eval_pdf(direction(si.wi), direction(wo));
         return {seen(context, si, wo, v.value), v.pdf};
     }
 
-    std::pair<BSDFSample3f, Spectrum> sampled(const BSDFContext& context, const nma::Material& material,
+    std::pair<BSDFSample3f, Spectrum> sampled(const BSDFContext& context, const nma::Brdf& brdf,
                                               const SurfaceInteraction3f& si, Float u, const Point2f& u2) const {
-        const nma::Sampled s = material.sample(direction(si.wi), u, u2.x(), u2.y());
+        const nma::Sampled s = brdf.sample(direction(si.wi), u, u2.x(), u2.y());
         BSDFSample3f drawn = dr::zeros<BSDFSample3f>();
         if (!(s.pdf > 0.0f)) return {drawn, 0.0f};
         drawn.wo = Vector3f(s.wo.x, s.wo.y, s.wo.z);
@@ -172,7 +172,7 @@ private:
         if (!(wo.z() > 0.0f)) return 0.0f;
         SurfaceInteraction3f turned = si;
         turned.wi = wo;
-        const nma::Vec3<float> back = prepare(turned).eval(direction(wo), direction(si.wi)).value;
+        const nma::Vec3<float> back = prepare(turned).eval(direction(wo), direction(si.wi));
         return Spectrum(back.x, back.y, back.z) * (wo.z() / si.wi.z());
     }
 

@@ -75,6 +75,13 @@ struct Albedos {
     T clearcoat;
 };
 
+// A turn about the normal, given by cosine and sine of the azimuth that becomes 0.
+template <class T>
+struct Plane {
+    T cos_phi;
+    T sin_phi;
+};
+
 // Density of microfacet normals per solid angle, times 1 over projected area [1/sr]. Heitz 2014, eq. 84.
 template <class T>
 inline T ggx_d(const Vec3<T>& m, T alpha_x, T alpha_y) {
@@ -357,6 +364,27 @@ inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
     const auto sin2 = (exp(log(alpha2) * (T(1.0) - u2)) - alpha2) / (T(1.0) - alpha2);
     const auto sin_theta = safe_sqrt(sin2);
     return reflect<T>(wi, Vec3<T>{sin_theta * cos(phi), sin_theta * sin(phi), safe_sqrt(T(1.0) - sin2)});
+}
+
+// The plane through the normal and the unit direction `wi`; at normal incidence that of the x axis.
+template <class T>
+inline Plane<T> plane_of(const Vec3<T>& wi) {
+    const auto sin2 = wi.x * wi.x + wi.y * wi.y;
+    const auto tilted = sin2 > T(1e-12);
+    const auto inverse = T(1.0) / sqrt(select(tilted, sin2, T(1.0)));
+    return Plane<T>{select(tilted, wi.x * inverse, T(1.0)), select(tilted, wi.y * inverse, T(0.0))};
+}
+
+// `v` as seen from the plane: `wi` itself gets the azimuth 0.
+template <class T>
+inline Vec3<T> plane_enter(const Plane<T>& self, const Vec3<T>& v) {
+    return Vec3<T>{self.cos_phi * v.x + self.sin_phi * v.y, self.cos_phi * v.y - self.sin_phi * v.x, v.z};
+}
+
+// Inverse of `enter`.
+template <class T>
+inline Vec3<T> plane_leave(const Plane<T>& self, const Vec3<T>& v) {
+    return Vec3<T>{self.cos_phi * v.x - self.sin_phi * v.y, self.sin_phi * v.x + self.cos_phi * v.y, v.z};
 }
 
 }  // namespace nma

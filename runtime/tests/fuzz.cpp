@@ -33,9 +33,9 @@ bool attempt(const std::uint8_t* data, std::size_t size) {
         adapter.clamp(parameters.data());
         require(adapter.check(parameters.data()) < 0);
         const nma::Direction wi{0.5196152f, 0.6928203f, 0.5f};
-        const nma::Material material = adapter.prepare(parameters.data(), wi);
-        const nma::Value v = material.eval(wi, {0.0f, 0.6f, 0.8f});
-        const nma::Sampled s = material.sample(wi, 0.3f, 0.4f, 0.5f);
+        const nma::Brdf brdf = adapter.prepare(parameters.data(), wi);
+        const nma::Value v = brdf.eval_pdf(wi, {0.0f, 0.6f, 0.8f});
+        const nma::Sampled s = brdf.sample(wi, 0.3f, 0.4f, 0.5f);
         require(sound(v.value, v.pdf) && sound(s.value, s.pdf));
         return true;
     } catch (const nma::Error&) {

@@ -1,7 +1,7 @@
 // Random materials and directions by the million: nothing is NaN, infinite or negative, and samples agree with eval.
 //
 //     c++ -std=c++17 -O2 -pthread -Iruntime runtime/tests/soak.cpp -o soak
-//     ./soak CALLS WEIGHTS        calls of eval, pdf and sample together; threads share the adapter
+//     ./soak CALLS WEIGHTS        calls of eval_pdf, pdf and sample together; threads share the adapter
 #include "nma.h"
 
 #include <atomic>
@@ -59,20 +59,20 @@ const char* round_of_calls(const nma::Adapter& adapter, Random& random) {
     float parameters[64];
     draw_parameters(adapter, random, parameters);
     const nma::Direction wi = draw_direction(random);
-    const nma::Material material = adapter.prepare(parameters, wi);
+    const nma::Brdf brdf = adapter.prepare(parameters, wi);
     for (int k = 0; k < CALLS_PER_ROUND / 6; ++k) {
         const nma::Direction wo = draw_direction(random);
-        const nma::Value v = material.eval(wi, wo);
-        if (!sound(v.value, v.pdf)) return "eval";
-        if (!close(material.pdf(wi, wo), v.pdf)) return "pdf against eval";
+        const nma::Value v = brdf.eval_pdf(wi, wo);
+        if (!sound(v.value, v.pdf)) return "eval_pdf";
+        if (!close(brdf.pdf(wi, wo), v.pdf)) return "pdf against eval_pdf";
         for (int n = 0; n < 2; ++n) {
-            const nma::Sampled s = material.sample(wi, random(), random(), random());
+            const nma::Sampled s = brdf.sample(wi, random(), random(), random());
             if (!sound(s.value, s.pdf)) return "sample";
             if (s.pdf == 0.0f) continue;
-            const nma::Value again = material.eval(wi, s.wo);
+            const nma::Value again = brdf.eval_pdf(wi, s.wo);
             if (!close(again.pdf, s.pdf) || !close(again.value.x, s.value.x) || !close(again.value.y, s.value.y) ||
                 !close(again.value.z, s.value.z))
-                return "sample against eval";
+                return "sample against eval_pdf";
         }
     }
     return nullptr;
