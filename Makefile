@@ -31,7 +31,7 @@ lint:
 
 figures:
 	@tools/setup.sh test
-	$(BIN)/python figures $(ARGS)
+	$(BIN)/python -m figures $(ARGS)
 
 types:
 	@tools/setup.sh test

@@ -1,15 +1,15 @@
 """Lists the benches, or runs them one after the other.
 
-python bench                                         what there is
-python bench all [--quick] [--output FOLDER]         run all of them
-python bench NAME ... [--quick] [--output FOLDER]    run some
+python -m bench                                         what there is
+python -m bench all [--quick] [--output FOLDER]         run all of them
+python -m bench NAME ... [--quick] [--output FOLDER]    run some
+python -m bench.NAME --help                             what one of them takes
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -44,12 +44,8 @@ def main() -> None:
     if arguments.output:
         arguments.output.mkdir(parents=True, exist_ok=True)
     for name in known if "all" in arguments.names else arguments.names:
-        # The command stands in the results: no path of this machine.
-        command = [
-            sys.executable,
-            os.path.relpath(known[name]),
-            *words(name, arguments.quick, arguments.output),
-        ]
+        options = words(name, arguments.quick, arguments.output)
+        command = [sys.executable, "-m", f"bench.{name}", *options]
         print(f"== {name}: {' '.join(command[1:])}", flush=True)
         subprocess.run(command, check=True)
 

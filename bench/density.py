@@ -1,6 +1,6 @@
 """Fig. 9 of the paper: a frame's time over the medium's extinction, which lengthens walks and leaves adapters alone.
 
-python bench/density.py [--variant scalar_rgb llvm_ad_rgb] [--scene environment] [--size 192] [--spp 64] [--runs 3]
+python -m bench.density [--variant scalar_rgb llvm_ad_rgb] [--scene environment] [--size 192] [--spp 64] [--runs 3]
     [--rr-depth 5] [--quick] [--output out/bench]
 
 A nearly white medium between a coat and silver, so that walks end by leaving it alone. Beyond sigma_t = 1, where
@@ -17,13 +17,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import frames
 import numpy as np
-import scenes
 from matplotlib.figure import Figure
 
 import nma
 import nma.render
+from bench import frames, scenes
 from nma.render.load import DEFAULT_ADAPTER
 
 SIGMAS = (0.0, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)

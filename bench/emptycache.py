@@ -4,6 +4,6 @@ import os
 import sys
 import tempfile
 
-assert "drjit" not in sys.modules, "import emptycache first"
+assert "drjit" not in sys.modules, "import bench.emptycache first"
 _FOLDER = tempfile.TemporaryDirectory()
 os.environ["DRJIT_CACHE_DIR"] = _FOLDER.name

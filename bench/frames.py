@@ -12,7 +12,6 @@ import argparse
 import gc
 import math
 import resource
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,21 +19,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from machine import header
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scenes import RR_DEPTH, digest
 
 import nma.render
+from bench.machine import header
+from bench.scenes import RR_DEPTH, digest
+from figures import common
 from nma.cli.console import progress
 from nma.render.load import load_dict
 from nma.render.measure import render_seconds
 from nma.render.progressive import render_passes
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "figures"))
-import common  # noqa: E402
-
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]  # figures by name; None where one is not known
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"

@@ -22,10 +22,12 @@ def header() -> str:
             *(f"{n} {fields[n]}" for n in ("cpu family", "model") if n in fields),
         ]
         model = ", ".join(name for name in names if name) or model
+    main = sys.modules["__main__"].__spec__
+    program = ["-m", main.name] if main else sys.argv[:1]
     load = "{:.2f} {:.2f} {:.2f}".format(*os.getloadavg())
     return (
         f"machine  {model}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}\n"
         f"load     {load}\n"
         f"python   {platform.python_version()}\n"
-        f"command  {shlex.join([Path(sys.executable).name, *sys.argv])}"
+        f"command  {shlex.join([Path(sys.executable).name, *program, *sys.argv[1:]])}"
     )

@@ -1,6 +1,6 @@
 """What a network costs in a vectorised frame: time over its multiply-adds, beside the simulation and `principled`.
 
-python bench/networks.py [--scene lights] [--networks 1x16 3x32 3x64 5x64] [--size 160] [--spp 48] [--runs 5]
+python -m bench.networks [--scene lights] [--networks 1x16 3x32 3x64 5x64] [--size 160] [--spp 48] [--runs 5]
     [--rr-depth 5] [--quick] [--output out/bench]
 
 A whole frame is one kernel that no profiler looks into. So the material, textured, is rendered by adapters that differ
@@ -17,12 +17,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-import frames
 import numpy as np
-import scenes
 from matplotlib.figure import Figure
 
 import nma
+from bench import frames, scenes
 from nma import network
 from nma.render.load import DEFAULT_ADAPTER
 

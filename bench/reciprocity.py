@@ -1,6 +1,6 @@
 """How far adapters are from reciprocal: what a path traced from the light would see, against one from the camera.
 
-python bench/reciprocity.py [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
+python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
 
 The blend is prepared at the view direction, so that f(wi, wo) and f(wo, wi) are two functions. Without a renderer,
 both are averaged over directions drawn from the blend's own samples. For every named material:
@@ -18,11 +18,11 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
-import frames
 import numpy as np
 from numpy.typing import NDArray
 
 import nma
+from bench import frames
 from nma import target
 from nma.adapter import Adapter
 from nma.ops import Vec3

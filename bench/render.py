@@ -1,6 +1,6 @@
 """Time, variance and error of `principled`, `layered` and `nma` in the preview scene, without textures and with three.
 
-    python bench/render.py [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
+    python -m bench.render [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
 
 Frames of all BSDFs take turns, so that other load on the machine meets all of them; `load` is its average at start
 and end. `time` is the median wall time of a frame and `cpu` the median of its processor seconds, without
@@ -23,13 +23,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import emptycache  # noqa: F401
-import frames
 import numpy as np
-import scenes
-from frames import Array, Frames
 from matplotlib.figure import Figure
 
+import bench.emptycache  # noqa: F401
+from bench import frames, scenes
+from bench.frames import Array, Frames
 from nma import materials
 from nma.adapter import shipped
 from nma.images.metrics import errors

@@ -1,6 +1,6 @@
 """Nanoseconds of the C++ runtime by instruction set, beside Eigen, NumPy, drjit.nn and a decoder of 1.07 M numbers.
 
-python bench/runtime.py [--json OUT.json]
+python -m bench.runtime [--json OUT.json]
 
 One thread, best of many repetitions. Eigen takes part where its headers are installed (Debian: libeigen3-dev).
 """
@@ -20,9 +20,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import drjit as dr
 import numpy as np
-from machine import header
 
 import nma
+from bench.machine import header
 from nma import network
 from nma.adapter import weights_file
 from nma.llvm import ensure_llvm

@@ -1,6 +1,6 @@
 """Fig. 8 of the paper: squared error and variance of the teaser over samples per pixel and over seconds.
 
-python bench/samples.py [--variant scalar_rgb] [--size 144] [--spp 1024] [--runs 3] [--reference-spp 8192]
+python -m bench.samples [--variant scalar_rgb] [--size 144] [--spp 1024] [--runs 3] [--reference-spp 8192]
     [--rr-depth 5] [--quick] [--output out/bench]
 
 Frames of 1, 2, 4 ... --spp samples, --runs of each or more, BSDFs in turns. The error is that against a converged
@@ -18,11 +18,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import frames
-import scenes
 from matplotlib.figure import Figure
 
 import nma
+from bench import frames, scenes
 
 # Up to so many samples per pixel there are more runs, of so many in total each.
 CHEAP = 32

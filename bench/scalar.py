@@ -1,6 +1,6 @@
 """Table 4 of the paper: unseen materials in Mitsuba's scalar renderer, simulation against adapters, at equal samples.
 
-python bench/scalar.py [--scene sphere|environment|preview|lights] [--materials 92] [--size 96] [--spp 32] [--runs 3]
+python -m bench.scalar [--scene sphere|environment|preview|lights] [--materials 92] [--size 96] [--spp 32] [--runs 3]
     [--error 8] [--reference-spp 2048] [--rr-depth 5] [--quick] [--output out/bench]
 
 BSDFs take turns within a material, so that other load on the machine meets all of them; a frame's time is the median of
@@ -18,11 +18,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import frames
-import scenes
 from matplotlib.figure import Figure
 
 import nma
+from bench import frames, scenes
 
 SCENE = "sphere"
 # Means of the paper's Table 4.

@@ -1,6 +1,6 @@
 """Simulation or adapter? Time, variance, error and efficiency by renderer, scene, and with or without textures.
 
-python bench/settings.py [--variant scalar_rgb llvm_ad_rgb] [--scene preview lights environment] [--materials 4]
+python -m bench.settings [--variant scalar_rgb llvm_ad_rgb] [--scene preview lights environment] [--materials 4]
     [--size 192] [--spp 64] [--runs 4] [--reference-spp 1024] [--rr-depth 5] [--quick] [--output out/bench]
 
 Untextured materials are unseen ones of the paper's ranges, and adapters curves over the viewing angle; textured ones
@@ -25,13 +25,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import frames
 import numpy as np
-import scenes
 from matplotlib.figure import Figure
 
 import nma
 import nma.render
+from bench import frames, scenes
 
 KINDS = ("untextured", "textured")
 SCENES = ("preview", "lights", "environment")

@@ -1,6 +1,6 @@
 """Fig. 1 of the paper: a textured scene at equal samples, by simulation and by adapter.
 
-python bench/teaser.py [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3] [--reference-spp 2048]
+python -m bench.teaser [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3] [--reference-spp 2048]
     [--adapter layered3-5x64] [--rr-depth 5] [--quick] [--output out/bench]
 
 Three shader balls whose parameters come from textures, so that the network runs at every shading point. Below the
@@ -19,11 +19,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import frames
 import numpy as np
-import scenes
 from numpy.typing import NDArray
 
+from bench import frames, scenes
 from nma.images.metrics import errors
 from nma.images.sheet import Row, contact_sheet
 from nma.render.load import DEFAULT_ADAPTER

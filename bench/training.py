@@ -1,6 +1,6 @@
 """Bins per second of a training step, ours and the paper's recipe, and what part of a step each stage takes.
 
-python bench/training.py [--steps 300]
+python -m bench.training [--steps 300]
 
 Stages: drawing a batch (on a thread of its own), the network with its derivatives, the target over the points of the
 bins with its derivatives and Adam, and the term of the directional albedo. The last two are differences of whole steps.
@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from machine import header
 
 import nma
+from bench.machine import header
 from nma.table.dataset import Settings, simulate_block
 from nma.train import loop
 from nma.train.batches import Batch, BinSampler, Pool, draw

@@ -1,6 +1,6 @@
 """Walks per second of the layered source over Table 1 draws, for several numbers of materials, and peak memory.
 
-python bench/walks.py [--walks 819200] [--repeat 3]
+python -m bench.walks [--walks 819200] [--repeat 3]
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import resource
 import time
 
 import numpy as np
-from machine import header
 
 import nma
+from bench.machine import header
 from nma.table import stream_keys
 
 

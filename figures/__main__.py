@@ -1,8 +1,9 @@
 """Lists the experiments, or runs them.
 
-python figures                     what there is
-python figures all [--quick]       run all of them
-python figures NAME ... [--quick]  run some
+python -m figures                     what there is
+python -m figures all [--quick]       run all of them
+python -m figures NAME ... [--quick]  run some
+python -m figures.NAME.run --help     what one of them takes
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ def experiments() -> dict[str, Path]:
 
 def main() -> None:
     known, wanted = experiments(), [word for word in sys.argv[1:] if word != "--quick"]
+    quick = ["--quick"] if "--quick" in sys.argv else []
     if not wanted:
         for name, script in known.items():
             summary = (ast.get_docstring(ast.parse(script.read_text())) or "").splitlines()[0]
@@ -31,7 +33,7 @@ def main() -> None:
     if unknown:
         sys.exit(f"no experiment {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     for name in known if "all" in wanted else wanted:
-        command = [sys.executable, str(known[name]), *(["--quick"] if "--quick" in sys.argv else [])]
+        command = [sys.executable, "-m", f"figures.{name}.run", *quick]
         print(f"== {name}: {' '.join(command[1:])}", flush=True)
         subprocess.run(command, check=True)
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import nma
+from nma import files
 from nma.evaluate.metrics import table_metrics
 
 ROOT = Path(__file__).parent.parent
@@ -50,10 +51,7 @@ def write_json(path: Path, data: Any) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """A whole file or none, whenever the run is killed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(text)
-    partial.replace(path)
+    files.write_bytes(path, text.encode())
 
 
 def reference(name: str, quick: bool) -> nma.Tables:
@@ -81,10 +79,8 @@ def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
 
 def save_array(path: Path, array: NDArray) -> None:
     """Writes an .npy file: whole or not at all, whenever the run is killed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial.npy")
-    np.save(partial, array)
-    partial.replace(path)
+    with files.whole(path) as partial:
+        np.save(partial, array)
 
 
 def figures(

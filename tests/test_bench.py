@@ -9,18 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import nma.render
+from bench import density, frames, samples, scenes, settings
+from nma.render.scene import CAMERAS
+
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "bench"))
-
-import density  # noqa: E402
-import frames  # noqa: E402
-import samples  # noqa: E402
-import scenes  # noqa: E402
-import settings  # noqa: E402
-
-import nma.render  # noqa: E402
-from nma.render.scene import CAMERAS  # noqa: E402
-
 # Those that draw what they found.
 PICTURED = ["density", "networks", "render", "samples", "scalar", "settings", "teaser"]
 SIMULATION = {"seconds": 2.0, "variance": 0.4, "error": 0.4, "doubt": 0.03}
@@ -29,7 +22,7 @@ OTHER = {"seconds": 1.0, "variance": 0.2, "error": None, "doubt": None}
 
 
 def bench(*words):
-    command = [sys.executable, str(ROOT / "bench"), *map(str, words)]
+    command = [sys.executable, "-m", "bench", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=900, check=False)
 
 

@@ -14,7 +14,7 @@ NEED_DATA = {"library"}
 
 
 def figures(*words):
-    command = [sys.executable, str(ROOT / "figures"), *words]
+    command = [sys.executable, "-m", "figures", *words]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=600, check=False)
 
 

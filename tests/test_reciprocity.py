@@ -1,14 +1,9 @@
 """What `bench/reciprocity.py` measures: how far an adapter is from reciprocal."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 from adapter_cases import materials, random_adapter
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "bench"))
-
-import reciprocity  # noqa: E402
+from bench import reciprocity
 
 MATERIAL = materials(1)[0]
 

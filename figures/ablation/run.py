@@ -1,6 +1,6 @@
 """What each choice of the training recipe is worth: the preset `class` with one setting changed, and the paper's.
 
-    python figures/ablation/run.py [--quick] [--data layered3.zarr] [--steps 15000]
+    python -m figures.ablation.run [--quick] [--data layered3.zarr] [--steps 15000]
 
 Trains from a dataset of 8000 materials (made with `nma dataset layered3 FOLDER --seed 1`) and evaluates on every third
 material of both sets. A run that was finished is not repeated: its figures wait in out/figures/ablation.
@@ -9,7 +9,6 @@ material of both sets. A run that was finished is not repeated: its figures wait
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,12 +19,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
+from figures import common
 from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import preset
 from nma.train.run import train_class
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 # What changes, by name. The paper's recipe sees as many bins in total, at its own learning rate and at higher ones.
 CHANGES = {

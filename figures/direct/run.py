@@ -1,6 +1,6 @@
 """Paper Table 5 and Fig. 11: the adapters beside a network of a million weights that evaluates f itself.
 
-    python figures/direct/run.py [--quick] [--data FOLDER.zarr] [--steps N] [--latent-steps N]
+    python -m figures.direct.run [--quick] [--data FOLDER.zarr] [--steps N] [--latent-steps N]
 
 Trains a latent per material and a decoder (evaluator.py) on the adapters' dataset, then latents of the 89 validation
 materials on their own references, as the paper does for Fan et al. 2022; the adapters see their parameters alone. Both
@@ -10,14 +10,12 @@ Writes direct.json, direct.md and direct.png beside this file; with --quick, of 
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import evaluator as direct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +23,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma
+from figures import common
+from figures.direct import evaluator as direct
 from nma import network, target
 from nma.adapter import encoding
 from nma.cli import console
@@ -32,9 +32,6 @@ from nma.evaluate.metrics import mean_metrics, table_metrics
 from nma.ops import Vec3
 from nma.table import ISOTROPIC, quadrature
 from nma.table.dataset import Settings, simulate_block
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 SET = "range"
 NETWORK, QUICK_NETWORK = "5x512", "2x32"

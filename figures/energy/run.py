@@ -1,6 +1,6 @@
 """Directional albedo of the shipped adapters over 100,000 random materials and 64 angles: it never exceeds 1 (eq. 5).
 
-    python figures/energy/run.py [--quick]
+    python -m figures.energy.run [--quick]
 
 Albedos are means of value / pdf over samples of the target itself. All pairs of material and angle are estimated
 coarsely, the brightest ones again with more and more samples; each round says how far two independent estimates differ.
@@ -9,7 +9,6 @@ The same is done with the bound taken away. Writes energy.json and energy.png be
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,13 +16,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
+from figures import common
 from nma import ops, target
 from nma.jit import dr
 from nma.ops import Vec3
 from nma.table import quadrature
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 ANGLES = 64
 CHUNK = 1_000_000

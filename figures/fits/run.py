@@ -1,13 +1,12 @@
 """Fits every named material and compares each fit with an independent reference (paper Fig. 4, left).
 
-    python figures/fits/run.py [--quick] [MATERIAL ...]
+    python -m figures.fits.run [--quick] [MATERIAL ...]
 
 Writes fits.json and fits.png beside this file; with --quick, three materials and few walks, to out/figures/fits.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 
@@ -15,12 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
+from figures import common
 from nma.table import stream_keys
 from nma.train.recipe import preset
 from nma.train.run import fit_material
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """The named materials in the preview scene, its two lightings side by side, and the noise that each leaves.
 
-    python figures/gallery/run.py [--quick] [--adapter FILE]
+    python -m figures.gallery.run [--quick] [--adapter FILE]
 
 Writes gallery.png, every named material and one with textures; lighting.png, six materials by either lighting; and
 gallery.json, the noise of six pictures of 128 samples per pixel, as `nma render` made them before there was a studio,
@@ -10,7 +10,6 @@ out/figures/gallery.
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 import nma
 import nma.render
+from figures import common
 from nma import materials
 from nma.images.metrics import errors
 from nma.images.sheet import PAPER, Row, contact_sheet
@@ -28,9 +28,6 @@ from nma.render.clamp import clamped
 from nma.render.demo import worn_silver
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
 from nma.render.progressive import render_passes, sampler
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 Image = NDArray[np.float32]
 COLUMNS = 5

@@ -1,6 +1,6 @@
 """A library of the 100 NBRDF-MERL materials in one small network, and its latent space (paper Fig. 12).
 
-    python figures/library/run.py [--quick] [--steps N] [--data FILE] [--new FILE] [--held-out N] [--size N] [--spp N]
+    python -m figures.library.run [--quick] [--steps N] [--data FILE] [--new FILE] [--held-out N] [--size N] [--spp N]
 
 Trains as `nma train-library` does, compares each material with its table, learns the codes of materials that training
 has not seen, and renders mixtures of four. The networks of NBRDF-MERL and a measured material are no part of this
@@ -12,7 +12,6 @@ few BSDFs of Mitsuba's and with little training, to out/figures/library.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 import nma
 import nma.render
+from figures import common, studio
 from nma.adapter.library import Library
 from nma.cli.console import TrainingBar, progress
 from nma.images.io import tonemap
@@ -32,10 +32,6 @@ from nma.table import Tables, collection
 from nma.table.collection import Member
 from nma.train import library as training
 from nma.train.recipe import Recipe
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
-import studio
 
 DATA = common.DATA
 NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"

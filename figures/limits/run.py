@@ -1,6 +1,6 @@
 """What limits the class adapters: unseen materials, beside fits of several targets to each of them alone.
 
-    python figures/limits/run.py [--quick] [--materials N]
+    python -m figures.limits.run [--quick] [--materials N]
 
 A fit knows its material, so what it leaves is the target's error; what a class adapter leaves beyond a fit of its own
 target is the network's, the data's and the optimiser's. Each of the first materials of the set "range", which is in
@@ -11,7 +11,6 @@ Writes limits.json and limits.png beside this file; with --quick, short fits to 
 from __future__ import annotations
 
 import json
-import sys
 from argparse import Namespace
 from functools import partial
 from pathlib import Path
@@ -20,11 +19,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
+from figures import common
 from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 SET = "range"
 # Targets that are fitted; the first one is the class adapters'.

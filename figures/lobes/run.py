@@ -1,6 +1,6 @@
 """Lobes of a layered material, fitted by one Principled BRDF and by a blend of two that follows wi (paper Fig. 2).
 
-    python figures/lobes/run.py [--quick] [MATERIAL ...]
+    python -m figures.lobes.run [--quick] [MATERIAL ...]
 
 Both targets are fitted to the same table of 64 M walks, and compared with an independent one of as many. Plotted are
 bin averages of f cos(theta_o) in the plane of incidence. Writes lobes.json and lobes.png beside this file; with
@@ -9,7 +9,6 @@ bin averages of f cos(theta_o) in the plane of incidence. Writes lobes.json and 
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -20,12 +19,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma
+from figures import common
 from nma.table import stream_keys
 from nma.train.recipe import preset
 from nma.train.run import fit_material
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 MATERIALS = ("copper-purple-medium", "beetle-green")
 ANGLES = (20, 50, 75)  # of wi, in degrees

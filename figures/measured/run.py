@@ -1,6 +1,6 @@
 """Single materials from any source: measured, analytic, isotropic or not, against the alternatives (paper Fig. 13).
 
-    python figures/measured/run.py [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
+    python -m figures.measured.run [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
 
 Fits each material as `nma fit` does with a 3x32 network, and compares the fit with the material itself at 20,000 random
 pairs of directions and in a picture; beside it the best constant Principled BRDF, and for RGL's measurements the NBRDF
@@ -24,6 +24,7 @@ from matplotlib import colormaps
 
 import nma
 import nma.render
+from figures import common, studio
 from nma import network
 from nma.adapter import Adapter
 from nma.adapter.values import AdapterValues
@@ -40,10 +41,6 @@ from nma.sources.nbrdf import WEIGHTS, Nbrdf
 from nma.table.values import tabulate_values
 from nma.train.constant import CONSTANT, fit_constant
 from nma.train.fit import recipe_for
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
-import studio
 
 DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")

@@ -1,6 +1,6 @@
 """Rendered error of the shipped adapters and of a single instance over samples per pixel (paper Table 2, last rows).
 
-    python figures/rendered/run.py [--quick] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
+    python -m figures.rendered.run [--quick] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
         [--single WEIGHTS] [--only SUBJECT ...]
 
 Pictures of few samples differ from their reference by noise, whatever renders them. So every adapter, and the
@@ -26,14 +26,11 @@ from numpy.typing import NDArray
 
 import nma
 import nma.render
+from figures import common, studio
 from nma.cli.console import progress
 from nma.images.metrics import METRICS
 from nma.images.sheet import Row, contact_sheet
 from nma.render.load import material_bsdf
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
-import studio
 
 SIMULATION, AGAIN, SINGLE = "reference", "simulation again", "single"
 # Of the paper's Table 2: blended + omega_i against single.
@@ -113,7 +110,7 @@ def subjects(arguments: argparse.Namespace) -> list[Subject]:
         found.append(Subject(SINGLE, arguments.single, spp, 3))
     elif not arguments.quick:
         sys.exit(
-            f"{arguments.single}: no such file; figures/variants/run.py --only single --seeds 1 makes it"
+            f"{arguments.single}: no such file; `python -m figures.variants.run --only single --seeds 1` makes it"
         )
     return found
 

@@ -43,7 +43,7 @@ def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dic
     bound = "bounded" if adapter.bounded else "not bounded"
     return f"""# {name}
 
-Written by `python figures/shipped/run.py`. An adapter for the class `{adapter.space.name}`: {adapter.variant}, a
+Written by `python -m figures.shipped.run`. An adapter for the class `{adapter.space.name}`: {adapter.variant}, a
 network {recipe["network"]} of {count:,} numbers, encoding `{adapter.encoding}`, energy {bound}.
 
 ## Training

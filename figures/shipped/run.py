@@ -1,6 +1,6 @@
 """The shipped adapters on materials they have not seen: 89 from Table 1's ranges, 60 with real metals.
 
-    python figures/shipped/run.py [--quick] [--adapter FILE ...]
+    python -m figures.shipped.run [--quick] [--adapter FILE ...]
 
 Every third of the 60 has a metal that training never saw. References of 64 M walks per material are simulated once,
 from the seeds below, into out/references (about 15 minutes on 2 cores; a killed run resumes). Writes shipped.json,
@@ -11,17 +11,14 @@ out/figures/shipped.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import nma
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import card
-import common
+from figures import common
+from figures.shipped import card
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """BSDF slices at 70 degrees and at normal incidence, of six unseen materials and of their adapter (paper Fig. 10).
 
-    python figures/slices/run.py [--quick] [--adapter FILE]
+    python -m figures.slices.run [--quick] [--adapter FILE]
 
 The materials are taken from the reference set "range" by the roughness of their coats, evenly from sharp to rough.
 Writes slices.json and slices.png beside this file; with --quick, four materials with few walks, to out/figures/slices.
@@ -8,7 +8,6 @@ Writes slices.json and slices.png beside this file; with --quick, four materials
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma
+from figures import common
 from nma.images.io import tonemap
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 MATERIALS = 6
 ANGLES = (70, 0)  # of wi, in degrees

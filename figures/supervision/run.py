@@ -1,6 +1,6 @@
 """Paper Fig. 5: what a fit learns from the centre of a bin, from 1 to 20 points in it, and from points that crowd.
 
-    python figures/supervision/run.py [--quick]
+    python -m figures.supervision.run [--quick]
 
 A 3x32 network that sees the view direction alone is fitted to a smooth conductor and to a layered material, always with
 the paper's loss and target, the same table, steps and learning rate; only the points that stand for a bin differ. The
@@ -10,7 +10,6 @@ supervision.json and supervision.png beside this file; with --quick, three short
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 import nma
 import nma.render
+from figures import common
 from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
 from nma.render.load import load_dict, material_bsdf
@@ -27,9 +27,6 @@ from nma.render.progressive import render_passes
 from nma.table import stream_keys
 from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 # The paper's conductor lies bare; this class has a coat, so we make it smooth and almost index-matched.
 BARE = {"alpha_top": 0.001, "alpha_bottom": 0.01, "eta_top": 1.05, "albedo": 1.0, "sigma_t": 0.0}

@@ -1,6 +1,6 @@
 """Layered textures, zero-shot: roughness, extinction and albedo come from textures, one after the other (paper Fig. 7).
 
-    python figures/textures/run.py [--quick] [--adapter FILE]
+    python -m figures.textures.run [--quick] [--adapter FILE]
 
 Reference and adapter render the preview scene around one material: (a) without textures, (b) with a texture for the
 metal's roughness, (c) also for the extinction, (d) also for the albedo of the medium. The reference is rendered once
@@ -10,7 +10,6 @@ this file; with --quick, (a) and (d) alone, small and with few samples, to out/f
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,15 +18,13 @@ import numpy as np
 
 import nma
 import nma.render
+from figures import common
 from nma.images.metrics import difference_image
 from nma.images.sheet import Row, contact_sheet
 from nma.render.demo import DEPTH, FLIP_SCALE, TEXTURE_SCALE
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
 from nma.render.progressive import render_passes
 from nma.render.textures import bitmap_texture, procedural_textures
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 # Dull copper under a blue medium and a rough coat.
 MATERIAL = "copper-purple-medium"

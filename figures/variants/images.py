@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from train import Job, Store
 
 import nma
+from figures import common, studio
+from figures.variants.train import Job, Store
 from nma.images.metrics import METRICS
 from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
 from nma.render.load import material_bsdf
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
-import studio
 
 Images = NDArray[np.float32]
 # Seeds of the renderings: the references' own, and that of the second one, which shows what noise alone scores.

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from paper import PERCENT, TABLE_2, TABLE_3
-from train import INSTANCES, VARIANTS, Job
 
 import nma
+from figures.variants.paper import PERCENT, TABLE_2, TABLE_3
+from figures.variants.train import INSTANCES, VARIANTS, Job
 from nma.images.metrics import METRICS
 
 Results = dict[Job, dict[str, Any]]

@@ -1,6 +1,6 @@
 """Paper Fig. 3, Table 2, Fig. 6 and Table 3: the target's variants over the size of the dataset, and in pictures.
 
-    python figures/variants/run.py [--quick] [--data FOLDER.zarr] [--sizes N ...] [--seeds N] [--steps N]
+    python -m figures.variants.run [--quick] [--data FOLDER.zarr] [--sizes N ...] [--seeds N] [--steps N]
         [--only VARIANT ...] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
 
 Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md), and on the validation
@@ -17,15 +17,13 @@ import sys
 from pathlib import Path
 
 import jax
-import report
-from images import Gallery, View, sheet
-from train import ALL, INSTANCES, VARIANTS, Job, Store, plan
 
 import nma
 import nma.render
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
+from figures import common
+from figures.variants import report
+from figures.variants.images import Gallery, View, sheet
+from figures.variants.train import ALL, INSTANCES, VARIANTS, Job, Store, plan
 
 SET = "range"
 SETTINGS = ("sizes", "seeds", "steps", "materials", "resolution", "spp", "reference_spp")

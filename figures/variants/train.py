@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import nma
+from figures import common
 from nma.errors import NmaError
 from nma.evaluate.metrics import mean_metrics
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 # The paper's variants: (instances, whether their parameters follow the view direction).
 VARIANTS = {

@@ -1,0 +1,1 @@
+"""Benches: how long things take, and what a frame is worth."""

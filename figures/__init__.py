@@ -1,0 +1,1 @@
+"""Experiments: what the figures and tables of the project are made by."""
