@@ -251,6 +251,7 @@ def same_image(a, b):
     return all(t.passed for t in tests.values()), worst
 
 
+@pytest.mark.slow
 def test_light_sampling_equals_bsdf_sampling(monkeypatch):
     """Next-event estimation with MIS against BSDF sampling alone; a value off by 3 % would be seen."""
     register_bsdf_sampling()

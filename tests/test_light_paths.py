@@ -153,6 +153,7 @@ SCALAR = """
 """
 
 
+@pytest.mark.slow
 def test_the_scalar_plugin_does_the_same(folder):
     plugins()
     bsdfs = [{**PLAIN, "adapter": str(folder / "stretched.safetensors")}, {**PLAIN, "online": True}]

@@ -146,6 +146,7 @@ def test_damaged_files_load_or_are_refused(weights, tmp_path):
     assert 0 < loaded < total
 
 
+@pytest.mark.slow
 def test_the_c_header_is_c(tmp_path):
     """And C++ without exceptions, linked with a library that has them."""
     text = '#include "nma_c.h"\nint main(void) { return !nma_supported(NMA_PORTABLE) || nma_load("none", 0, 0, 0); }\n'

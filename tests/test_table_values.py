@@ -233,6 +233,7 @@ def test_a_material_that_a_table_does_not_have_is_refused():
         TableValues(random_tables(SMALL), 2, name="mine")
 
 
+@pytest.mark.slow
 def test_a_material_survives_a_merl_file():
     """From the renderer through MERL's resolution to a table."""
     direct, through = (tabulate_values(source, points=64) for source in (ggx(0.1), Merl.of(ggx(0.1))))

@@ -235,6 +235,7 @@ def test_samples_follow_their_density(bins):
     assert 0.35 < np.median(p) < 0.65
 
 
+@pytest.mark.slow
 def test_an_alpha_off_by_five_per_cent_is_rejected(bins):
     p = p_values(bins, seed=3, alpha_scale=1.05)
     assert p.min() < SIDAK

@@ -67,7 +67,7 @@ class Killed(Exception):
     """Stands for the end of the process."""
 
 
-@pytest.mark.parametrize("moment", (50, 150))
+@pytest.mark.parametrize("moment", (150, pytest.param(50, marks=pytest.mark.slow)))
 def test_a_killed_run_resumes_as_if_nothing_had_happened(tables, tmp_path, monkeypatch, moment):
     whole, expected = training.train_class(LAYERED3, TINY, tables, {})
     monkeypatch.setattr(loop, "_CHECKPOINT_SECONDS", 0.0)
@@ -230,7 +230,7 @@ sys.meta_path.insert(0, Block())
 """
 
 
-@pytest.mark.parametrize("missing", ("jax", "optax"))
+@pytest.mark.parametrize("missing", ("jax", pytest.param("optax", marks=pytest.mark.slow)))
 def test_without_jax_or_optax_the_user_learns_what_to_install(missing, tmp_path):
     code = BLOCKED.format(missing=missing) + "from nma.cli import main; main()"
     options = ("fit", "gold-red-lacquer", "-o", str(tmp_path / "gold.safetensors"), "--walks", "40")
