@@ -109,7 +109,7 @@ def plot(seconds: dict[str, Seconds], arguments: argparse.Namespace, path: Path)
         axes.grid(alpha=0.3)
         axes.legend(title="largest to smallest", fontsize="small", loc="upper left")
     figure.axes[0].set_ylabel(f"seconds, {arguments.size} x {arguments.size}, {arguments.spp} spp")
-    frames.save_figure(figure, path)
+    frames.common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma.render
@@ -280,12 +279,6 @@ def settings(arguments: argparse.Namespace) -> dict[str, Any]:
 def write(path: Path, head: str, arguments: argparse.Namespace, **data: Any) -> None:
     """Results as JSON, after the machine (its `header` at the start) and the settings."""
     common.write_json(path, {"machine": head.splitlines(), "settings": settings(arguments)} | data)
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    print(path)
 
 
 def begin(variant: str | None = None) -> str:

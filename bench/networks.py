@@ -94,7 +94,7 @@ def plot(seconds: dict[str, float], products: dict[str, int], line: tuple[float,
     axes.set(xlabel="multiply-adds of the network", ylabel="seconds of a frame", ylim=(0, None))
     axes.grid(alpha=0.3)
     axes.legend()
-    frames.save_figure(figure, path)
+    frames.common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -184,7 +184,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         panel.grid(alpha=0.3)
         panel.legend()
     panels[0].set_ylabel("expected RMS error of the picture")
-    frames.save_figure(figure, path)
+    frames.common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

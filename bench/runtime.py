@@ -25,6 +25,7 @@ import nma
 from bench.machine import header
 from nma import network
 from nma.adapter import weights_file
+from nma.files import write_text
 from nma.llvm import ensure_llvm
 from nma.native import build
 
@@ -56,8 +57,8 @@ def main() -> None:
                     f"  {row['network']:7} {row['set']:16} {row['ns']:7.1f} {100 * row['ns'] / peak:6.0f} %"
                 )
     if arguments.json:
-        arguments.json.write_text(
-            json.dumps({"machine": header().splitlines(), "rows": rows}, indent=1) + "\n"
+        write_text(
+            arguments.json, json.dumps({"machine": header().splitlines(), "rows": rows}, indent=1) + "\n"
         )
 
 

@@ -112,7 +112,7 @@ def plot(curves: dict[str, Curve], arguments: argparse.Namespace, path: Path) ->
     left.set(xlabel="samples per pixel", ylabel="mean squared error; variance dotted")
     right.set(xlabel=f"seconds, {arguments.variant}")
     right.legend()
-    frames.save_figure(figure, path)
+    frames.common.save_figure(figure, path)
 
 
 def column(curve: Curve, key: str) -> list[float | None]:

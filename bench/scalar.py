@@ -106,7 +106,7 @@ def plot(rows: list[Figures], scene: str, path: Path) -> None:
     for axes in (left, right):
         axes.grid(alpha=0.3)
     left.legend(fontsize="small")
-    frames.save_figure(figure, path)
+    frames.common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

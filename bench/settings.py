@@ -31,6 +31,7 @@ from matplotlib.figure import Figure
 import nma
 import nma.render
 from bench import frames, scenes
+from nma.files import write_text
 
 KINDS = ("untextured", "textured")
 SCENES = ("preview", "lights", "environment")
@@ -58,7 +59,7 @@ def main() -> None:
     text = frames.markdown(columns, [list(row.values()) for row in rows])
     print(text)
     frames.write(arguments.output / "settings.json", head, arguments, rows=rows, measured=measured)
-    frames.common.write_text(arguments.output / "settings.md", text + "\n")
+    write_text(arguments.output / "settings.md", text + "\n")
     plot(rows, arguments.output / "settings.png")
     shutil.rmtree(parts)
 
@@ -150,7 +151,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         axes.set(title=renderer, ylabel="efficiency over layered")
         axes.grid(axis="y", alpha=0.3)
     figure.axes[0].legend()
-    frames.save_figure(figure, path)
+    frames.common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import nma
@@ -45,13 +46,14 @@ def results(script: str, quick: bool) -> Path:
 
 
 def write_json(path: Path, data: Any) -> None:
-    write_text(path, json.dumps(data, indent=1) + "\n")
+    files.write_text(path, json.dumps(data, indent=1) + "\n")
     print(f"{path}")
 
 
-def write_text(path: Path, text: str) -> None:
-    """A whole file or none, whenever the run is killed."""
-    files.write_bytes(path, text.encode())
+def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
+    with files.whole(path) as file:
+        figure.savefig(file, dpi=dpi)
+    print(f"{path}")
 
 
 def reference(name: str, quick: bool) -> nma.Tables:
@@ -73,14 +75,14 @@ def reference(name: str, quick: bool) -> nma.Tables:
 def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
     """What `make` returned when it was first called for this JSON file, or returns now."""
     if again or not path.exists():
-        write_text(path, json.dumps(make()))
+        files.write_text(path, json.dumps(make()))
     return json.loads(path.read_text())
 
 
 def save_array(path: Path, array: NDArray) -> None:
-    """Writes an .npy file: whole or not at all, whenever the run is killed."""
-    with files.whole(path) as partial:
-        np.save(partial, array)
+    """Writes an .npy file."""
+    with files.whole(path) as file:
+        np.save(file, array)
 
 
 def figures(

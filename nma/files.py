@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -45,10 +46,36 @@ def whole(path: str | Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A folder to be filled, which becomes `path` once the block has ended; if it fails, nothing is left.
+
+    Where another process makes the same folder and is faster, its folder stays.
+    """
+    partial = _partial(path)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        try:
+            partial.rename(path)
+        except OSError:
+            if not path.is_dir():
+                raise
+    except OSError as error:
+        raise _refused(path, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Writes a whole file, as `whole`."""
     with whole(path) as file:
         file.write_bytes(content)
+
+
+def write_text(path: str | Path, content: str) -> None:
+    """The same for text, as UTF-8."""
+    write_bytes(path, content.encode())
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nma.errors import NmaError, OutputError
-from nma.files import try_file, try_folder, whole, write_bytes
+from nma.files import try_file, try_folder, whole, whole_folder, write_bytes
 from nma.images import io
 from nma.sources import nbrdf
 from nma.sources.merl import SHAPE, Merl
@@ -75,6 +75,25 @@ def test_a_failed_write_keeps_the_old_file_and_nothing_else(tmp_path):
         1 / 0  # noqa: B018
     assert contents(tmp_path) == ["a.png"]
     assert path.read_text() == "old"
+
+
+def test_a_folder_is_whole_or_not_there(tmp_path):
+    with pytest.raises(ZeroDivisionError), whole_folder(tmp_path / "made") as folder:
+        (folder / "half").touch()
+        1 / 0  # noqa: B018
+    assert contents(tmp_path) == []
+    with whole_folder(tmp_path / "new" / "made") as folder:
+        (folder / "all").touch()
+    assert contents(tmp_path) == ["new", "new/made", "new/made/all"]
+
+
+def test_of_two_who_make_a_folder_the_first_wins(tmp_path):
+    with whole_folder(tmp_path / "made") as late:
+        (late / "file").write_text("late")
+        with whole_folder(tmp_path / "made") as early:
+            (early / "file").write_text("early")
+    assert contents(tmp_path) == ["made", "made/file"]
+    assert (tmp_path / "made" / "file").read_text() == "early"
 
 
 def _full(*args, **kwargs):

@@ -63,16 +63,6 @@ def test_what_the_compiler_says_is_passed_on(tmp_path):
         build._compile([source, "-o", tmp_path / "broken"], [])
 
 
-def test_a_failed_build_leaves_nothing(tmp_path):
-    def make(folder):
-        (folder / "half").touch()
-        raise build.BuildError("no")
-
-    with pytest.raises(build.BuildError):
-        build._whole(tmp_path / "made", make)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.slow
 def test_python_reaches_the_batched_kernel(tmp_path):
     from nma.native.runtime import Runtime, available

@@ -8,11 +8,12 @@ clamp a negative channel are no metals for our purpose and are dropped.
 """
 
 import argparse
-import csv
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+
+from nma.files import write_text
 
 OUT = Path(__file__).parents[1] / "nma" / "data" / "conductors.csv"
 HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
@@ -50,19 +51,15 @@ def main() -> None:
     files = (Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")
     names = sorted((f.name.removesuffix(".eta.spd") for f in files), key=lambda name: (name.lower(), name))
 
-    kept = 0
-    with out.open("w", newline="") as stream:
-        source = f"Mitsuba {mi.__version__} data/ior"
-        stream.write(f"# Linear sRGB (eta, k) of {source}; written by tools/make_conductors.py\n")
-        rows = csv.writer(stream, lineterminator="\n")
-        rows.writerow(HEADER)
-        for name in names:
-            eta, k = project(name)
-            if eta.min() > 0 and k.min() > MIN_K:
-                numbers = (f"{x:.7g}" for x in (*eta, *k))
-                rows.writerow((name, *numbers, int(substance(name) in HELD_OUT)))
-                kept += 1
-    print(f"{out}: {kept} of {len(names)} conductors")
+    source = f"Mitsuba {mi.__version__} data/ior"
+    lines = [f"# Linear sRGB (eta, k) of {source}; written by tools/make_conductors.py", ",".join(HEADER)]
+    for name in names:
+        eta, k = project(name)
+        if eta.min() > 0 and k.min() > MIN_K:
+            numbers = (f"{x:.7g}" for x in (*eta, *k))
+            lines.append(",".join([name, *numbers, str(int(substance(name) in HELD_OUT))]))
+    write_text(out, "\n".join([*lines, ""]))
+    print(f"{out}: {len(lines) - 2} of {len(names)} conductors")
 
 
 if __name__ == "__main__":

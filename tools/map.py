@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+from nma.files import write_text
 from tools import rooms
 from tools.layout import Arrow, Layout, Place, layout
 
@@ -69,7 +70,7 @@ orient="auto-start-reverse" markerUnits="userSpaceOnUse"><path d="M0 0 10 5 0 10
 
 def main() -> None:
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else OUT
-    out.write_text(drawing())
+    write_text(out, drawing())
     print(listing())
     print(out)
 

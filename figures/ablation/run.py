@@ -103,7 +103,7 @@ def plot(results: dict, path: Path) -> None:
         axes.grid(alpha=0.3, axis="x")
     figure.axes[0].invert_yaxis()
     figure.axes[0].legend()
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

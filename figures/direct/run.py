@@ -29,6 +29,7 @@ from nma import network, target
 from nma.adapter import encoding
 from nma.cli import console
 from nma.evaluate.metrics import mean_metrics, table_metrics
+from nma.files import write_text
 from nma.ops import Vec3
 from nma.table import ISOTROPIC, quadrature
 from nma.table.dataset import Settings, simulate_block
@@ -86,7 +87,7 @@ def main() -> None:
     print_means(label, results[label])
     text = markdown(results)
     print(text)
-    (folder / "direct.md").write_text(text)
+    write_text(folder / "direct.md", text)
     common.write_json(folder / "direct.json", results)
     plot(results, folder / "direct.png")
 
@@ -221,7 +222,7 @@ def plot(results: dict[str, Any], path: Path) -> None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     figure.axes[-1].set_xlabel("validation materials, by the direct evaluator's absolute error")
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -115,7 +115,7 @@ def plot(curves: dict[str, np.ndarray], path: Path) -> None:
     axes.axhline(1.0, color="black", linewidth=0.8)
     axes.grid(alpha=0.3)
     axes.legend()
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

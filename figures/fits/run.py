@@ -65,7 +65,7 @@ def plot(rows: list[dict], path: Path) -> None:
     left.legend()
     right.barh(names, [row["albedo_error"] for row in rows])
     right.set(xlabel="albedo error")
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

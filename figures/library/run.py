@@ -27,6 +27,7 @@ import nma.render
 from figures import common, studio
 from nma.adapter.library import Library
 from nma.cli.console import TrainingBar, progress
+from nma.files import write_text
 from nma.images.io import tonemap
 from nma.table import Tables, collection
 from nma.table.collection import Member
@@ -82,7 +83,7 @@ def main() -> None:
     }
     text = markdown(data)
     print(text)
-    (folder / "library.md").write_text(text)
+    write_text(folder / "library.md", text)
     common.write_json(folder / "library.json", data)
     sheet(pictures, flips, folder / "library.png")
 
@@ -114,7 +115,7 @@ def write_quick(kept: Path) -> None:
     """A few of Mitsuba's BSDFs in files, four to train on and one that is new."""
     for name, bsdf in QUICK.items():
         path = kept / ("new.xml" if name == "new" else f"materials/{name}.xml")
-        common.write_text(path, bsdf.replace("<bsdf", '<bsdf version="3.0.0"') + "\n")
+        write_text(path, bsdf.replace("<bsdf", '<bsdf version="3.0.0"') + "\n")
 
 
 def tabulated(members: Sequence[Member], kept: Path) -> Tables:
@@ -272,8 +273,7 @@ def sheet(pictures: dict[str, Any], flips: list[dict[str, Any]], path: Path) -> 
         words = f"{row['name']}\n(reference)\n\n{errors}"
         at, anchor = (-0.06, "top") if top else (1.06, "bottom")
         place.text(0.5, at, words, transform=place.transAxes, ha="center", va=anchor, fontsize=8)
-    figure.savefig(path, dpi=130)
-    print(f"{path}")
+    common.save_figure(figure, path, dpi=130)
 
 
 def show(axes: Any, image: NDArray[np.float32]) -> None:

@@ -98,7 +98,7 @@ def plot(rows: list[dict], path: Path) -> None:
     axes.set_xticks(range(len(rows)))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def plot(fits: dict[str, Fit], path: Path) -> None:
         ax.set_title(rf"$\theta_i$ = {angle}°", fontsize=10)
     what = r"f cos $\theta_o$ [1/sr] in the plane of incidence, radius its square root; sharp peaks are cut off. "
     figure.suptitle(what + r"Thick: reference, thin: fit, arrow: $\omega_i$", fontsize=10)
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:

@@ -30,6 +30,7 @@ from nma.adapter import Adapter
 from nma.adapter.values import AdapterValues
 from nma.cli.console import TrainingBar
 from nma.evaluate.pairs import Pairs, compare
+from nma.files import write_text
 from nma.images.metrics import flip_map
 from nma.images.sheet import Row, contact_sheet
 from nma.ops import Vec3
@@ -90,7 +91,7 @@ def main() -> None:
         print(rows[-1], flush=True)
     text = markdown(rows)
     print(text)
-    common.write_text(folder / "measured.md", text)
+    write_text(folder / "measured.md", text)
     common.write_json(folder / "measured.json", rows)
     contact_sheet(folder / "measured.png", pictures, ("material", "3x32 fit", "FLIP of the fit"))
 

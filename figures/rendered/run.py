@@ -28,6 +28,7 @@ import nma
 import nma.render
 from figures import common, studio
 from nma.cli.console import progress
+from nma.files import write_text
 from nma.images.metrics import METRICS
 from nma.images.sheet import Row, contact_sheet
 from nma.render.load import material_bsdf
@@ -191,7 +192,7 @@ def report(
     }
     text = markdown(means, arguments)
     print(text)
-    (folder / "tables.md").write_text(text)
+    write_text(folder / "tables.md", text)
     settings = {key: getattr(arguments, key) for key in ("materials", "resolution", "spp", "reference_spp")}
     flips = {
         name: {metric: [round(row[metric], 5) for row in by_spp[max(by_spp)]] for metric in PAPER}
@@ -255,8 +256,7 @@ def plot(means: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
         axes.set(xlabel="samples per pixel", ylabel=metric.replace("_", "-").upper())
         axes.grid(alpha=0.3, which="both")
     axes.legend()
-    figure.savefig(path, dpi=110)
-    print(f"{path}")
+    common.save_figure(figure, path)
 
 
 def sheet(

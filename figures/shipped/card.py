@@ -10,8 +10,10 @@ from matplotlib.figure import Figure
 
 import nma
 import nma.render
+from figures import common
 from nma import network
 from nma.evaluate.metrics import FIGURES
+from nma.files import write_text
 from nma.images.metrics import compare_images, difference_image
 from nma.images.sheet import Row, contact_sheet
 from nma.render.load import load_dict
@@ -33,7 +35,7 @@ def write(weights: str, sets: dict[str, tuple[nma.Tables, dict]], folder: Path, 
     _histogram(sets, folder / f"{name}-errors.png")
     captions = _worst(weights, sets, folder / f"{name}-worst.png", quick)
     card = folder / f"{name}.md"
-    card.write_text(_text(name, adapter, sets, captions))
+    write_text(card, _text(name, adapter, sets, captions))
     return card
 
 
@@ -91,7 +93,7 @@ def _histogram(sets: dict[str, tuple[nma.Tables, dict]], path: Path) -> None:
         ax.hist(values, bins=25, label=list(sets))
         ax.set(xlabel=text, ylabel="materials")
         ax.legend()
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 def _worst(weights: str, sets: dict[str, tuple[nma.Tables, dict]], path: Path, quick: bool) -> list[str]:

@@ -70,7 +70,7 @@ def plot(results: dict, path: Path) -> None:
         ax.set(xlabel="materials, sorted", ylabel=text)
         ax.grid(alpha=0.3)
     axes[0].legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -116,7 +116,7 @@ def plot(tables: nma.Tables, adapter: NDArray, label: str, path: Path) -> None:
     bar = figure.colorbar(shown, ax=axes, shrink=0.35, pad=0.01)
     bar.set_label("absolute error, mean of channels [1/sr]", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 def caption(params: NDArray) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import nma
+from figures import common
 from figures.variants.paper import PERCENT, TABLE_2, TABLE_3
 from figures.variants.train import INSTANCES, VARIANTS, Job
 from nma.images.metrics import METRICS
@@ -160,7 +161,7 @@ def plot(losses: dict[str, dict[str, Any]], floor: float, path: Path) -> None:
     axes.minorticks_off()
     axes.grid(alpha=0.3)
     figure.legend(loc="outside right upper", fontsize=9)
-    figure.savefig(path, dpi=110)
+    common.save_figure(figure, path)
 
 
 _LEFT_ABOVE: dict[str, Any] = {

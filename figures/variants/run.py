@@ -24,6 +24,7 @@ from figures import common
 from figures.variants import report
 from figures.variants.images import Gallery, View, sheet
 from figures.variants.train import ALL, INSTANCES, VARIANTS, Job, Store, plan
+from nma.files import write_text
 
 SET = "range"
 SETTINGS = ("sizes", "seeds", "steps", "materials", "resolution", "spp", "reference_spp")
@@ -106,7 +107,7 @@ def write(
         found["images"][name] = {metric: report.statistics([value]) for metric, value in metrics}
     tables = report.markdown(found, noise, floor)
     print(tables)
-    (folder / "tables.md").write_text(tables)
+    write_text(folder / "tables.md", tables)
     settings = {key: getattr(arguments, key) for key in SETTINGS}
     runs = [{**vars(job), **result} for job, result in results.items()]
     common.write_json(folder / "variants.json", {"settings": settings, "noise": noise, **found, "runs": runs})

@@ -14,6 +14,7 @@ import nma
 from figures import common
 from nma.errors import NmaError
 from nma.evaluate.metrics import mean_metrics
+from nma.files import write_text
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
 
@@ -135,9 +136,7 @@ class Store:
                 return stored["value"]
         began = time.perf_counter()
         value = make()
-        temporary = path.with_suffix(".partial")
-        temporary.write_text(json.dumps({"key": key, "value": value}, indent=1))
-        temporary.replace(path)
+        write_text(path, json.dumps({"key": key, "value": value}, indent=1))
         print(f"{job.stem}: {kind} in {time.perf_counter() - began:.0f} s", flush=True)
         return value
 

@@ -5,10 +5,11 @@ from pathlib import Path
 
 from nma.export.classes import classes
 from nma.export.cpp import cpp
+from nma.files import write_text
 
 FILES = {"nma/target.h": cpp, "nma/classes.h": classes}
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runtime")
 for name, generate in FILES.items():
-    (folder / name).write_text(generate())
+    write_text(folder / name, generate())
     print(folder / name)

@@ -15,12 +15,12 @@ import platform
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
 from nma.errors import MissingDependencyError, NmaError
+from nma.files import whole_folder
 
 PLUGINS = ("nma", "layered")
 _ADAPTERS = Path(__file__).parent.parent / "adapter" / "trained"
@@ -85,7 +85,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
     flags += [f"-L{mitsuba}", f"-L{drjit}", "-lmitsuba", "-ldrjit-core", "-ldrjit-extra"]
     flags.append(_leave_undefined())
 
-    def make(into: Path) -> None:
+    with whole_folder(folder) as into:
         (into / "plugins").mkdir()
         for name in PLUGINS:
             plugin = into / "plugins" / f"{name}{_suffix()}"
@@ -93,17 +93,16 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
             # Libraries come after what needs them.
             _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", plugin], flags)
         shutil.copytree(_ADAPTERS, into / "adapters")
-
-    _whole(folder, make)
     return folder
 
 
 def library() -> Path:
     """The C interface as a shared library, compiled unless it is there. Raises as `build_mitsuba`."""
-    folder = _cache() / f"library-{_digest()}"
+    folder, name = _cache() / f"library-{_digest()}", f"nma_c{_suffix()}"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", f"-I{sources()}"]
-    name = f"nma_c{_suffix()}"
-    _whole(folder, lambda into: _compile([sources() / "nma_c.cpp", "-o", into / name], flags))
+    if not folder.exists():
+        with whole_folder(folder) as into:
+            _compile([sources() / "nma_c.cpp", "-o", into / name], flags)
     return folder / name
 
 
@@ -130,24 +129,6 @@ def _suffix() -> str:
 def _leave_undefined() -> str:
     """What tells the linker that Mitsuba's libraries bring along symbols of their own."""
     return "-Wl,-undefined,dynamic_lookup" if sys.platform == "darwin" else "-Wl,--allow-shlib-undefined"
-
-
-def _whole(folder: Path, make: Callable[[Path], None]) -> None:
-    """The folder as `make` fills it: all of it or nothing, whenever this is killed."""
-    if folder.exists():
-        return
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
-    try:
-        make(partial)
-        try:
-            partial.rename(folder)
-        except OSError:
-            # Another process was faster.
-            if not folder.exists():
-                raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _compile(words: Sequence[str | Path], flags: Sequence[str]) -> None:

@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nma.files import write_bytes
+
 Array = NDArray[np.float64]
 
 SHELL_CENTRE = np.array([0.0, 0.0, 1.12])
@@ -113,7 +115,7 @@ def write_ply(path: Path, mesh: Mesh) -> None:
     face = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     face["count"], face["index"] = 3, mesh.faces
     vertex = np.concatenate([mesh.vertices, mesh.normals, mesh.uv], axis=1).astype("<f4")
-    path.write_bytes("\n".join([*header, ""]).encode() + vertex.tobytes() + face.tobytes())
+    write_bytes(path, "\n".join([*header, ""]).encode() + vertex.tobytes() + face.tobytes())
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,105 @@
+"""Every file is written by `nma.files`, whole or not at all: the code is searched for other ways to write one."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+# What writes, renames or copies files, whatever it is called on.
+WRITERS = {"write_text", "write_bytes", "save_file", "savez", "savez_compressed", "savefig", "tofile"}
+WRITERS |= {"NamedTemporaryFile", "mkstemp", "mkdtemp", "rename", "copytree", "copyfile", "copy2", "move"}
+# And what does so in these modules.
+OF_MODULES = {"np.save", "json.dump", "os.replace"}
+# Within these blocks a file or folder is filled that takes its place at the end.
+WHOLE = {"whole", "whole_folder"}
+ALLOWED = {
+    "nma/files.py": "what all others go through",
+    "figures/common.py: open": "a lock, which has no content",
+    "nma/render/shaderball.py: mkdtemp": "a folder of this process, gone with it",
+}
+
+
+def code() -> list[Path]:
+    return sorted(
+        file for folder in ("nma", "figures", "bench", "tools") for file in (ROOT / folder).rglob("*.py")
+    )
+
+
+def writes(tree: ast.AST) -> Iterator[ast.Call]:
+    """The calls that write a file themselves, outside of blocks that make it whole."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.With) and any(name(item.context_expr) in WHOLE for item in node.items):
+            continue
+        if isinstance(node, ast.Call) and is_write(node):
+            yield node
+        yield from writes(node)
+
+
+def name(node: ast.AST) -> str:
+    """The last part of what is called: `whole` of files.whole(path)."""
+    return ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
+
+
+def is_write(call: ast.Call) -> bool:
+    called = ast.unparse(call.func)
+    if called.startswith("files."):
+        return False
+    if called in OF_MODULES or (name(call) in WRITERS and "." in called):
+        return True
+    if name(call) == "open":
+        mode = [
+            arg.value
+            for arg in [*call.args, *(k.value for k in call.keywords)]
+            if isinstance(arg, ast.Constant)
+        ]
+        return any(isinstance(text, str) and text[:1] in "wax" and len(text) < 4 for text in mode)
+    # Texts take two arguments, fields of data classes keywords.
+    return name(call) == "replace" and "." in called and len(call.args) == 1 and not call.keywords
+
+
+def test_files_are_written_whole_everywhere():
+    found = []
+    for file in code():
+        place = str(file.relative_to(ROOT))
+        for call in writes(ast.parse(file.read_text())):
+            if place not in ALLOWED and f"{place}: {name(call)}" not in ALLOWED:
+                found.append(f"{place}:{call.lineno}: {ast.unparse(call)[:60]}")
+    assert not found, "write these by nma.files, which leaves no half of a file behind:\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "path.write_text('x')",
+        "Path(name).with_suffix('.md').write_bytes(b'x')",
+        "open(path, 'w')",
+        "path.open(mode='ab')",
+        "np.savez(path, a=a)",
+        "json.dump(data, file)",
+        "figure.savefig(path, dpi=110)",
+        "partial.replace(path)",
+        "os.replace(partial, path)",
+        "shutil.copytree(here, there)",
+    ],
+)
+def test_the_search_finds_what_writes(line):
+    assert list(writes(ast.parse(line)))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "with whole(path) as file:\n    figure.savefig(file)",
+        "with files.whole_folder(path) as folder:\n    shutil.copytree(here, folder)",
+        "files.write_text(path, 'x')",
+        "write_text(path, 'x')",
+        "text.replace('a', 'b')",
+        "replace(settings, seed=2)",
+        "path.open()",
+        "path.open('rb')",
+    ],
+)
+def test_the_search_passes_over_what_does_not(line):
+    assert not list(writes(ast.parse(line)))
