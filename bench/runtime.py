@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 # Before NumPy starts its threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -100,7 +101,7 @@ def drjit_nn(layers: list, many: np.ndarray) -> float:
     for matrix, _ in layers[:-1]:
         parts += [nn.Linear(matrix.shape[1], matrix.shape[0]), nn.ReLU()]
     parts.append(nn.Linear(layers[-1][0].shape[1], layers[-1][0].shape[0]))
-    net = nn.Sequential(*parts).alloc(TensorXf16, layers[0][0].shape[1])
+    net: Any = nn.Sequential(*parts).alloc(TensorXf16, layers[0][0].shape[1])
     net = nn.pack(net, layout="inference")
     inputs = [Float16(Float32(column)) for column in many.T]
     dr.eval(inputs, net)

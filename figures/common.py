@@ -90,6 +90,7 @@ def figures(
 ) -> list[dict[str, float]]:
     """The adapter's figures for every material, integrated once; `nma.evaluate_adapter` does so twice to know how
     exact it is. The tables must have standard errors."""
+    assert tables.error is not None
     return [
         table_metrics(nma.tabulate_adapter(adapter, params[None], directions=directions)[0], table, error)
         for params, table, error in zip(tables.params, tables.values, tables.error, strict=True)

@@ -70,8 +70,11 @@ class Values(Protocol):
     mirror image of a pair may still have another value, and a table's folded bins hold the mean of both.
     """
 
-    name: str
-    isotropic: bool
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def isotropic(self) -> bool: ...
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
         """f(wi, wo) cos(theta_o) [1/sr] for one pair of unit directions per Dr.Jit lane; 0 below the horizon.
