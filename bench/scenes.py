@@ -152,7 +152,7 @@ def sphere(
     bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH, hide_sun: bool = False
 ) -> dict[str, Any]:
     """A sphere that fills the picture under sun and sky, one environment map: the material dominates the time."""
-    options = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": hide_sun}
+    options: dict[str, Any] = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": hide_sun}
     scene = preview_scene(bsdf, size=size, **options)
     del scene["floor"], scene["lamp"]
     scene["sensor"]["fov"] = 19.0
@@ -184,7 +184,7 @@ def teaser(
     import mitsuba as mi
 
     subjects = [make() for make in TEXTURED.values()]
-    options = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": True}
+    options: dict[str, Any] = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": True}
     scene = preview_scene(model(subjects[0]), size=size, camera=WIDE, **options)
     scene["lamp"]["to_world"] = (
         mi.ScalarTransform4f()
