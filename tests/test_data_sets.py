@@ -57,12 +57,12 @@ def test_sound_copies_are_as_known(data, measurements):
     assert len(lines) >= len(known) == 6
     for name in known:
         (line,) = (line for line in lines if name in line)
-        assert line.startswith("ok") and line.endswith("sound, SHA-256 as known")
+        assert line.startswith("ok") and line.endswith("sound; its SHA-256 is that of the original")
 
 
 def test_a_file_without_a_known_checksum_is_read(data, uniform):
     code, out, _ = data("check", uniform)
-    assert (code, out) == (0, f"ok     MERL        {uniform}: sound; no checksum of it is known\n")
+    assert (code, out) == (0, f"ok     MERL        {uniform}: sound; its checksum is not known here\n")
 
 
 def test_faults_are_named_file_by_file(data, uniform, measurements):
@@ -92,9 +92,9 @@ def test_faults_are_named_file_by_file(data, uniform, measurements):
         "merl_nbrdf_weights.npz: 7 bytes instead of 256,573; copy it again": "FAULT",
         "networks.npz: names (1,) and weights (1, 3) are not (n,) and (n, 675); copy it again": "FAULT",
         "paper_white_rgb.bsdf: 658,927 bytes instead of 658,928; copy it again": "FAULT",
-        "sub/mine_rgb.bsdf: sound; no checksum of it is known": "ok",
-        "sub/paper_white_rgb.bsdf: sound, but not the file of that name: its SHA-256 is another": "FAULT",
-        "uniform.binary: sound; no checksum of it is known": "ok",
+        "sub/mine_rgb.bsdf: sound; its checksum is not known here": "ok",
+        "sub/paper_white_rgb.bsdf: sound, but not the original file: its SHA-256 differs": "FAULT",
+        "uniform.binary: sound; its checksum is not known here": "ok",
     }
 
 

@@ -1,7 +1,7 @@
-"""Where appearance comes from.
+"""The sources: models and files that say how materials look.
 
-A new class of materials to simulate is one file here and one line in `_FACTORIES`; a new kind of file that holds the
-values of materials is one file and one line in `_READERS`.
+To simulate a new class of materials, add one file to this folder and one line to `_FACTORIES`. To read a new kind of
+file with the values of materials, add one file and one line to `_READERS`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def names() -> tuple[str, ...]:
 
 
 def get(name: str) -> Source:
-    """The source model of a class."""
+    """The source that simulates the class `name`. Raises `ParamError` if there is no such class."""
     if name not in _FACTORIES:
         raise ParamError(f"unknown class '{name}'; known are {', '.join(_FACTORIES)}")
     return _FACTORIES[name]()
@@ -62,7 +62,8 @@ def _nbrdf(path: Path, material: str | None) -> Values:
     return nbrdf.Nbrdf.load(path, material)
 
 
-# How a file is read, by the end of its name; `material` chooses in files that hold several.
+# The function that reads a file, by the file's extension. Its second argument names a material, for files that hold
+# several.
 _READERS: dict[str, Callable[[Path, str | None], Values]] = {
     ".binary": _merl,
     ".bsdf": _rgl,
@@ -72,17 +73,17 @@ _READERS: dict[str, Callable[[Path, str | None], Values]] = {
 
 
 def endings() -> tuple[str, ...]:
-    """How the names of files end that `read` understands."""
+    """The extensions of the files that `read` understands."""
     return tuple(_READERS)
 
 
 def read(path: str | Path, material: str | None = None) -> Values:
-    """The values of one material, from a file.
+    """Reads the values of one material from a file.
 
-    MERL's `.binary`, RGL's `.bsdf`, a Mitsuba BSDF in `.xml`, or one of the NBRDF networks in an `.npz`. Raises
-    `SourceError` for other files, and for those that are missing or damaged.
+    The file is a MERL `.binary`, an RGL `.bsdf`, a Mitsuba BSDF in `.xml`, or an `.npz` with NBRDF networks, where
+    `material` names the network. Raises `SourceError` for any other file, and for a missing or damaged file.
     """
     path = Path(path)
     if path.suffix not in _READERS:
-        raise SourceError(f"{path}: no source reads such files; their names end in {', '.join(_READERS)}")
+        raise SourceError(f"{path}: no source reads such files; readable files end in {', '.join(_READERS)}")
     return _READERS[path.suffix](path, material)

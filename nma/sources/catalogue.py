@@ -1,6 +1,7 @@
-"""The data sets that sources read: where they come from, on what terms, and whether a copy of them is sound.
+"""The public data sets that sources read: their origins, their licences, and a check of a user's copy.
 
-Nothing is downloaded. Their terms decide what a user may do with them, and with what is made from them.
+Nothing is downloaded. A data set's licence decides what a user may do with its files and with everything made from
+them.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from nma.sources import merl, nbrdf, rgl
 class DataSet:
     """A data set.
 
-    `kind`: a measurement, or a neural reconstruction of one. `files`: what a complete copy holds. `known`: size in
-    bytes and SHA-256 of files by name, as far as copies were at hand.
+    `kind` says whether it is a measurement or a neural reconstruction of a measurement. `files` describes the files of
+    a complete copy. `known` gives the size in bytes and the SHA-256 of a file by its name; files that we had no copy of
+    are not in it.
     """
 
     name: str
@@ -48,8 +50,8 @@ DATASETS = (
         "measurement: isotropic and anisotropic materials",
         "https://rgl.epfl.ch/materials",
         "Dupuy and Jakob 2018, An Adaptive Parameterization for Efficient Material Acquisition and Rendering",
-        "not stated in the files; see there before passing any on",
-        "one file NAME_rgb.bsdf per material, about 0.5 to 1 MB where isotropic",
+        "not stated in the files; read the terms on that page before you pass a file on",
+        "one file NAME_rgb.bsdf per material; the file of an isotropic material has about 0.5 to 1 MB",
         {
             "cc_ibiza_sunset_rgb.bsdf": (
                 658_952,
@@ -85,7 +87,7 @@ DATASETS = (
     ),
     DataSet(
         "NBRDF-RGL",
-        "neural reconstruction: a network for each of 51 isotropic materials of RGL's",
+        "neural reconstruction: a network for each of 51 isotropic RGL materials",
         "https://github.com/asztr/Neural-BRDF (data/rgl-isotropic_nbrdf.zip), gathered in one file",
         "Sztrajman et al. 2021, Neural BRDF Representation and Importance Sampling",
         "MIT",
@@ -102,7 +104,7 @@ DATASETS = (
 
 @dataclass(frozen=True)
 class Finding:
-    """What `check` says of one file: the data set it belongs to, whether it is sound, and why or why not."""
+    """What `check` found out about one file: its data set, whether the file is sound (`ok`), and the reason."""
 
     path: Path
     dataset: str
@@ -111,10 +113,10 @@ class Finding:
 
 
 def check(path: str | Path) -> Iterator[Finding]:
-    """Looks at a file, or at all files of the data sets in a folder and below.
+    """Checks a file, or every file in a folder and its subfolders that belongs to a data set.
 
-    Compares size and checksum with those known, and reads the file to see whether structure and values make sense.
-    Raises `SourceError` where there is nothing to look at.
+    The check compares the file's size and checksum with the known ones. It also reads the file, to see whether its
+    structure and its values make sense. Raises `SourceError` if there is no file to check.
     """
     path = Path(path)
     if not os.path.exists(path):
@@ -130,7 +132,7 @@ def check(path: str | Path) -> Iterator[Finding]:
 
 
 def _check_file(path: Path) -> Finding:
-    """What is to be said of one file."""
+    """Checks one file."""
     reader = _READERS.get(path.suffix)
     if reader is None:
         return Finding(path, "", False, f"no file of a known data set ({', '.join(sorted(_READERS))})")
@@ -144,10 +146,10 @@ def _check_file(path: Path) -> Finding:
     except SourceError as e:
         return Finding(path, label, False, str(e).removeprefix(f"{path}: "))
     if not checksum:
-        return Finding(path, label, True, "sound; no checksum of it is known")
+        return Finding(path, label, True, "sound; its checksum is not known here")
     if hashlib.sha256(path.read_bytes()).hexdigest() != checksum:
-        return Finding(path, label, False, "sound, but not the file of that name: its SHA-256 is another")
-    return Finding(path, label, True, "sound, SHA-256 as known")
+        return Finding(path, label, False, "sound, but not the original file: its SHA-256 differs")
+    return Finding(path, label, True, "sound; its SHA-256 is that of the original")
 
 
 def _read_merl(path: Path) -> str:
@@ -164,25 +166,25 @@ def _read_nbrdf(path: Path) -> str:
     return nbrdf.kind(nbrdf.read(path)[0])
 
 
-# Reads a file, by the end of its name, and says what data set it belongs to.
+# The function that reads a file, by the file's extension. It returns the name of the file's data set.
 _READERS = {".binary": _read_merl, ".bsdf": _read_rgl, ".npz": _read_nbrdf}
-# The data set of a file that cannot be read.
+# The data set's name for a file that cannot be read, by extension.
 _LABELS = {".binary": "MERL", ".bsdf": "RGL", ".npz": "NBRDF"}
 
 
 def _belongs(path: Path) -> bool:
-    """Whether a file in a folder claims to be of a data set; `.npz` files hold other things too."""
+    """Whether a file in a folder looks like part of a data set. An `.npz` file may hold something else."""
     if path.suffix != ".npz":
         return path.suffix in _READERS
     try:
         with arrays(path) as f:
             return "weights" in f or path.name in _NAMES
-    except Exception:  # zipfile raises a kind of its own for damaged archives
+    except Exception:  # zipfile raises its own exceptions for damaged archives
         return path.name in _NAMES
 
 
 def _known(name: str) -> tuple[int, str]:
-    """Size and checksum of the file of that name; 0 and "" where none are known."""
+    """Size and checksum of the file `name`, or 0 and "" if they are not known."""
     return next((d.known[name] for d in DATASETS if name in d.known), (0, ""))
 
 

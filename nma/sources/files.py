@@ -1,4 +1,4 @@
-"""Reading the files of sources."""
+"""How sources read their files."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from nma.errors import SourceError
 
 
 def content(path: Path, dataset: str) -> bytes:
-    """All bytes of a file of that data set; `SourceError` if it is missing or cannot be read."""
+    """All bytes of a file of the data set `dataset`. Raises `SourceError` if the file cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
-        raise SourceError(f"{path}: no such file; see `nma data` for where {dataset}'s come from") from None
-    except (OSError, ValueError) as e:  # a name may be too long for a file, or hold a NUL
+        raise SourceError(f"{path}: no such file; `nma data` says where to get {dataset} files") from None
+    except (OSError, ValueError) as e:  # ValueError: the name contains a NUL
         raise SourceError(f"{path}: cannot be read: {getattr(e, 'strerror', e)}") from None
