@@ -60,6 +60,23 @@ def measurements() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def untrained(tmp_path_factory) -> Path:
+    """The weights file of a small adapter that has learnt nothing."""
+    import numpy as np
+
+    from nma import network
+    from nma.adapter import Adapter, encoding
+    from nma.params import LAYERED3
+    from nma.target import PRINCIPLED_PARAMS, output_size
+
+    sizes = [encoding.size("layered3", LAYERED3, True), 8, 8, output_size(2, PRINCIPLED_PARAMS)]
+    layers = network.init(np.random.default_rng(0), sizes)
+    path = tmp_path_factory.mktemp("untrained") / "tiny.safetensors"
+    Adapter(LAYERED3, "layered3", layers, 2, True, PRINCIPLED_PARAMS).save(path)
+    return path
+
+
 @pytest.fixture
 def nma(monkeypatch, capsys):
     """Runs `nma ARGUMENTS` in this process: exit status, stdout, stderr."""

@@ -90,7 +90,7 @@ def test_outputs_are_called_as_what_reads_them_wants(nma, tmp_path, monkeypatch,
 
 
 def test_a_network_is_refused_before_a_material_is_simulated(nma, tmp_path, monkeypatch):
-    monkeypatch.setattr("nma.cli.material.read", None)
+    monkeypatch.setattr("nma.cli.reading.known_of", None)
     code, _, err = nma("fit", "gold-red-lacquer", "--network", "0x8", "-o", tmp_path / "x.safetensors")
     assert code == 1 and "DEPTHxWIDTH" in err
 

@@ -1,7 +1,6 @@
 """Commands try their outputs before they begin, and end in one line where something cannot be written."""
 
 import errno
-import shutil
 import sys
 from pathlib import Path
 
@@ -11,9 +10,7 @@ from cli_cases import commands, parameters
 from typer.models import ArgumentInfo
 
 import nma.render.demo  # noqa: F401  # what tests replace in it must be there before
-from nma import table
 from nma.images.io import write_exr
-from nma.table import Tables
 
 WRITING = [words for words, function in commands() if "output" in {name for name, *_ in parameters(function)}]
 FUNCTIONS = dict(commands())
@@ -84,25 +81,6 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
     assert [path.name for path in bad.iterdir()] == ["file"]
 
 
-def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, monkeypatch):
-    save = np.savez_compressed
-
-    def fills_up(file, **arrays):
-        save(file, **arrays)
-        if not file.name.startswith(str(tmp_path / "x.npz.parts")):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", fills_up)
-    code, out, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")
-    assert (code, out) == (1, "")
-    assert "nma: " in err.splitlines()[-1] and "No space left" in err.splitlines()[-1]
-    # What was simulated waits for the next run.
-    assert [path.name for path in tmp_path.iterdir()] == ["x.npz.parts"]
-    monkeypatch.undo()
-    monkeypatch.setattr(table, "tabulate", None)
-    assert nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")[0] == 0
-
-
 def test_errors_of_the_system_elsewhere_are_one_line(nma, monkeypatch):
     def no_folder():
         raise PermissionError(errno.EACCES, "Permission denied", "/locked/cache")
@@ -158,32 +136,3 @@ def test_what_fails_in_the_end_fails_at_once(nma, tmp_path, monkeypatch, words, 
     code, out, err = nma(*words)
     assert (code, out) == (1, "")
     assert message in err.splitlines()[-1] and err.splitlines()[-1].startswith("nma: ")
-
-
-def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
-    output = tmp_path / "x.npz"
-    run = ("simulate", "--draw", 2, "--walks", 1600, "--seed", 5, "-o")
-    assert nma(*run, tmp_path / "right.npz")[0] == 0
-    parts = tmp_path / "x.npz.parts"
-    parts.mkdir()
-    for key in table.stream_keys(5, range(2)):
-        (parts / f"{key:016x}-1600.npz").write_bytes(b"PK\x03\x04damaged")
-    code, _, err = nma(*run, output)
-    assert code == 0, err
-    np.testing.assert_array_equal(Tables.load(output).values, Tables.load(tmp_path / "right.npz").values)
-    assert not parts.exists()
-
-
-def test_parts_that_another_run_takes_away_do_no_harm(nma, tmp_path, monkeypatch):
-    """Two runs into one output: the first that ends removes the folder, while the other is about to name a file."""
-    replace, taken = Path.replace, []
-
-    def without_folder(self, target):
-        if not taken:
-            taken.append(shutil.rmtree(tmp_path / "x.npz.parts"))
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", without_folder)
-    code, _, err = nma("simulate", "--draw", 2, "--walks", 1600, "-o", tmp_path / "x.npz")
-    assert code == 0, err
-    assert taken and [path.name for path in tmp_path.iterdir()] == ["x.npz"]

@@ -1,16 +1,20 @@
-"""The command line: parse, call, print. No physics here; one file per group of commands."""
+"""The command line: parse, call, print. No physics here.
+
+Each command is a file of its name; several that share a word, as `nma library list`, are one file. A new command is one
+such file with a function `register`, and its name in `COMMANDS`.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
 import nma
-from nma.cli import data, learn, library, mitsuba, principled, simulate, system, view
 from nma.errors import NmaError, one_line
 
 
@@ -39,8 +43,26 @@ app = typer.Typer(
     "numbers, "
     "[bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
-for group in (simulate, data, learn, library, principled, view, mitsuba, system):
-    group.register(app)
+# Files of this folder, each with the command or the group of its name, in the order of `nma --help`: commands first.
+COMMANDS = (
+    "materials",
+    "simulate",
+    "dataset",
+    "data",
+    "train",
+    "fit",
+    "evaluate",
+    "library",
+    "principled",
+    "render",
+    "compare",
+    "demo",
+    "mitsuba",
+    "info",
+    "doctor",
+)
+for name in COMMANDS:
+    import_module(f"nma.cli.{name}").register(app)
 
 
 def _print_version(wanted: bool) -> None:

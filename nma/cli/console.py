@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich import box
 from rich.cells import cell_len
@@ -13,7 +16,7 @@ from rich.table import Table
 
 from nma.progress import TrainingBar, err, progress
 
-__all__ = ["TrainingBar", "err", "loss_plot", "number", "out", "progress", "say", "table", "tell"]
+__all__ = ["TrainingBar", "counting", "err", "loss_plot", "number", "out", "progress", "say", "table", "tell"]
 
 out = Console()
 
@@ -44,6 +47,27 @@ def say(text: str) -> None:
 def tell(text: str) -> None:
     """The same on stdout."""
     out.print(text, soft_wrap=True, markup=False, highlight=False)
+
+
+@contextmanager
+def counting(
+    title: str, total: int, unit: str, before: int = 0, digits: int = 1
+) -> Iterator[Callable[..., Any]]:
+    """A progress bar that counts to `total`, from `before`, with a rate in `unit`.
+
+    Call what it yields with the count so far and the work since the start. It returns the rate, work per second.
+    `note` and `description` may change with each call.
+    """
+    with progress(unit) as bar:
+        task = bar.add_task(title, total=total, completed=before, rate="", note="")
+        began = time.perf_counter()
+
+        def show(done: int, work: float, **more: str) -> float:
+            rate = work / (time.perf_counter() - began)
+            bar.update(task, completed=done, rate=f"{rate:.{digits}f}", **more)  # type: ignore[arg-type]
+            return rate
+
+        yield show
 
 
 def number(value: float) -> str:

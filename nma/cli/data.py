@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from nma import files
-from nma.cli import console, options
+from nma.cli import console, options, reading
 
 data = typer.Typer(
     invoke_without_command=True,
@@ -72,20 +72,16 @@ def merl(
             help="A shipped adapter's name or a weights file, for named materials and material files."
         ),
     ] = "layered3-5x64",
-    clamp: Annotated[
-        bool,
-        typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range."),
-    ] = False,
+    clamp: options.Clamp = False,
 ) -> None:
     """Write any isotropic material as a MERL file: 90 x 90 x 180 values at half and difference angles.
 
     Example: [bold]nma data merl gold-red-lacquer -o gold.binary[/bold]
     """
     files.try_file(output)
-    from nma.cli.material import values_of
     from nma.sources.merl import SCALE, Merl
 
-    values = values_of(source, material, adapter, clamp)
+    values = reading.values_of(source, material, adapter, clamp)
     written = Merl.of(values)
     written.save(output)
     seen = (written.planes >= 0).all(axis=0)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from nma import files
-from nma.cli import console, options
+from nma.cli import console, options, training
 
 library = typer.Typer(
     no_args_is_help=True, help="Look at a library, learn the code of one more material, take one out."
@@ -45,8 +45,7 @@ def train_library(
     Example: [bold]nma train-library ~/merl -o library.safetensors[/bold]
     """
     from nma.table import collection
-    from nma.train import library as training
-    from nma.train.plot import plot_losses
+    from nma.train import library as learning
 
     files.try_file(output)
     kept, checkpoint = (output.with_name(output.name + ending) for ending in (".tables", ".ckpt"))
@@ -55,29 +54,20 @@ def train_library(
     members = collection.members(source)
     names = [member.name for member in members]
     given: dict[str, Any] = {"network": network, "steps": steps, "learning_rate": learning_rate, "seed": seed}
-    recipe = replace(training.RECIPE, **{k: v for k, v in given.items() if v is not None})
-    with console.progress("materials/s") as bar:
-        task = bar.add_task("tabulating", total=len(members), rate="", note="")
-        began = time.perf_counter()
-
-        def progress(done: int) -> None:
-            rate = done / (time.perf_counter() - began)
-            bar.update(task, completed=done, rate=f"{rate:.2f}", note=names[done - 1])
-
-        tables = collection.tables(members, kept, progress)
+    recipe = replace(learning.RECIPE, **{k: v for k, v in given.items() if v is not None})
+    with console.counting("tabulating", len(members), "materials/s", digits=2) as show:
+        tables = collection.tables(members, kept, lambda done: show(done, done, note=names[done - 1]))
     record: dict[str, Any] = {"data": collection.origin(members), "materials": len(members)}
     record["tables"] = hashlib.sha256("\n".join(names).encode() + tables.values.tobytes()).hexdigest()[:16]
     with console.TrainingBar(recipe) as training_bar:
-        made, run = training.train_library(
+        made, run = learning.train_library(
             names, tables, recipe, record, checkpoint=checkpoint, progress=training_bar.update
         )
     made.save(output)
-    plot = plot_losses(run.log_losses, console.loss_plot(output), output.name)
+    loss, plot = training.losses(run, output)
     checkpoint.unlink(missing_ok=True)
-    recent = run.log_losses[-500:]
     console.say(
-        f"{output}: {run.step} steps in {run.seconds:.0f} s, log loss of the last steps "
-        f"{sum(recent) / len(recent):.5f}; losses in {plot}"
+        f"{output}: {run.step} steps in {run.seconds:.0f} s, log loss of the last steps {loss:.5f}; losses in {plot}"
     )
     console.tell(
         f"{len(names)} materials ({record['data']}), {made.parameters:,} parameters: {made.codes.size:,} of codes, "
@@ -114,7 +104,7 @@ def encode(
     from nma.adapter.library import Library
     from nma.errors import ParamError
     from nma.table.values import tabulate_values
-    from nma.train import library as training
+    from nma.train import library as learning
 
     files.try_file(output)
     known = Library.load(path)
@@ -124,10 +114,10 @@ def encode(
     values = sources.read(source, material)
     with console.err.status(f"tabulating {values.name}"):
         tables = tabulate_values(values)
-    recipe = replace(training.ENCODING, seed=seed, steps=steps or training.ENCODING.steps)
+    recipe = replace(learning.ENCODING, seed=seed, steps=steps or learning.ENCODING.steps)
     began = time.perf_counter()
     with console.TrainingBar(recipe, "encoding") as bar:
-        found = training.encode(known, tables, recipe=recipe, progress=bar.update)
+        found = learning.encode(known, tables, recipe=recipe, progress=bar.update)
     known.add(name, found.code).save(output)
     console.say(f"{output}: {name} added in {time.perf_counter() - began:.0f} s")
     console.tell(

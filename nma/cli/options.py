@@ -68,11 +68,6 @@ def _network(name: str | None) -> str | None:
     return name
 
 
-_STEPS = number("Number of optimisation steps.", 1, 10**9)
-_RATE = number("Learning rate of Adam, its peak under the one-cycle schedule.", 1e-9, 10)
-
-Steps = Annotated[int | None, _STEPS]
-Rate = Annotated[float | None, _RATE]
 # As `nma.train.recipe.Recipe` and `nma.params` declare them.
 TARGETS = ("principled", "stretched", "measured", "anisotropic")
 POINTS_LAWS = ("crowded", "uniform", "centre")
@@ -81,9 +76,63 @@ POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
 # Of the paper: how many instances, and whether they follow the view direction.
 VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
 
+# Of training.
+Weights = Annotated[Path, output("The weights file to write.", ".safetensors")]
 Variant = Annotated[str, choice("Whether two instances are blended, and follow the direction.", *VARIANTS)]
 Network = Annotated[
     str | None,
     typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.", callback=_network),
 ]
-Weights = Annotated[Path, output("The weights file to write.", ".safetensors")]
+Target = Annotated[
+    str | None,
+    choice(
+        "The first has the paper's 11 numbers, the second stretches lobes along the plane of incidence, the third "
+        "lets them fade out, too, the last does the same along the surface's axes.",
+        *TARGETS,
+    ),
+]
+Steps = Annotated[int | None, number("Number of optimisation steps.", 1, 10**9)]
+Points = Annotated[int | None, number("Points per bin of the AvA estimate (eq. 6).", 1, 4096)]
+PointsLaw = Annotated[
+    str | None, choice("Where points lie: centre is point supervision, uniform the paper's.", *POINTS_LAWS)
+]
+Finest = Annotated[float | None, number("Microfacet width down to which points crowd.", 1e-6, 1)]
+Loss = Annotated[str | None, choice("log is the paper's eq. 7.", *LOSSES)]
+Albedo = Annotated[float | None, number("Weight of the error of the directional albedo; 0: none.", 0, 1e6)]
+Rate = Annotated[
+    float | None, number("Learning rate of Adam, its peak under the one-cycle schedule.", 1e-9, 10)
+]
+TrainingSeed = Annotated[int, seed("Seed of the weights, of the batches and of a simulated table.")]
+
+# Of adapters at work.
+AdapterName = Annotated[str, typer.Option(help="A shipped adapter's name or a weights file.")]
+Clamp = Annotated[
+    bool, typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range.")
+]
+
+# Of pictures.
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a parameter of the material: alpha_top=.2, albedo=.9,.1,.1 or #3366ee, conductor=Ag, "
+        "sigma_t=wear.png, alpha_bottom=orm.png,channel=g. May be repeated.",
+    ),
+]
+Camera = Annotated[str, typer.Option(help="hero, close or top.")]
+Lighting = Annotated[
+    str, typer.Option(help="studio, softboxes in a dim dome, or outdoors, sun, sky and a small lamp.")
+]
+Envmap = Annotated[
+    Path | None, typer.Option(help="Light by this environment map (EXR or HDR), instead of --lighting.")
+]
+Size = Annotated[str, typer.Option(help="Pixels: 512 for a square, or 512x384.")]
+Depth = Annotated[int, number("Longest path, in edges.", 1, 1000)]
+PictureSeed = Annotated[int, seed("Equal seeds give equal pictures.")]
+MitsubaVariant = Annotated[
+    str,
+    typer.Option(
+        help="Mitsuba's variant; auto is cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb."
+    ),
+]

@@ -1,17 +1,24 @@
-"""A material that a command names, and how the preview scene shows it."""
+"""The preview scene: what `nma render`, `compare` and `demo` show there, and how."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
+from nma.cli import console, reading
 from nma.errors import ParamError
 
 if TYPE_CHECKING:
     from nma.materials import Material
+
+# The parameters of commands that say what the preview scene shows, and how.
+OPTIONS = ("adapter", "clamp", "changes", "camera", "lighting", "envmap", "mesh", "mesh_up", "depth")
 
 
 class View(NamedTuple):
@@ -50,55 +57,69 @@ def use_rgb(variant: str) -> None:
     nma.render.use(variant)
 
 
-def read_material(name: str, changes: list[str] | None) -> Material:
-    """A named material, a material file, or an adapter that knows a single one; with `changes` given by --set."""
-    from nma import materials
-    from nma.adapter import Adapter
-    from nma.params import MEASURED
+def subject(
+    context: typer.Context, name: str, changes: list[str] | None, adapter: str
+) -> tuple[Material, str]:
+    """The material to show, and the adapter that shows it. An adapter of a single material is both.
 
+    Options that would do nothing for it are wrong usage.
+    """
+    refuse(context, ("define",), "a material")
+    if context.params["envmap"]:
+        refuse(context, ("lighting",), "--envmap")
+    if not context.params.get("mesh"):
+        refuse(context, ("mesh_up",), "the shader ball")
     if name.endswith(".safetensors"):
-        # An adapter that knows a single material is one.
-        adapter = Adapter.load(name)
-        if adapter.space.size and adapter.material is None:
-            raise ParamError(
-                f"{name} is an adapter of the whole class {adapter.space.name}; "
-                f"name a material, too: nma render MATERIAL --adapter {name}"
-            )
-        if adapter.material is not None:
-            return materials.Material.of_vector(Path(name).stem, adapter.material, adapter.space)
-        return materials.Material(Path(name).stem, name, "", MEASURED.name, {})
-    material = materials.load(name)
-    return material.changed(dict(map(read_change, changes)), "--set") if changes else material
+        refuse(context, ("model", "adapter", "changes"), "an adapter")
+        adapter = name
+    return reading.material_of(name, changes), adapter
 
 
-def read_change(text: str) -> tuple[str, Any]:
-    """`alpha_top=.2` and the like, as in a material file."""
-    name, value = assignment(text)
+def render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) -> Any:
+    """The image of a scene, behind a progress bar."""
+    from nma.render.progressive import render_passes
+
+    with samples_bar(title, spp) as advance:
+        return render_passes(scene, spp, seed=seed, integrator=integrator, progress=partial(advance, title))
+
+
+@contextmanager
+def samples_bar(title: str, total: int) -> Iterator[Callable[[str, int], None]]:
+    """A progress bar over samples per pixel. Call what it yields with what goes on and the samples just done."""
+    done = 0
+    with console.counting(title, total, "spp/s") as show:
+
+        def advance(what: str, samples: int) -> None:
+            nonlocal done
+            done += samples
+            show(done, done, description=what)
+
+        yield advance
+
+
+def pixels(text: str) -> tuple[int, int]:
+    """Width and height from `512` or `512x384`."""
+    from nma.render.progressive import check_size
+
+    found = re.fullmatch(r"([1-9]\d{0,8})(?:x([1-9]\d{0,8}))?", text.lower(), re.ASCII)
+    if found is None:
+        raise typer.BadParameter(f"size '{text}' is neither a number of pixels nor WIDTHxHEIGHT")
+    size = int(found[1]), int(found[2] or found[1])
     try:
-        numbers = [float(part) for part in value.split(",")]
-        return name, numbers if len(numbers) > 1 else numbers[0]
-    except ValueError:
-        return name, value if name == "conductor" or value.startswith("#") else _texture(value)
+        check_size(size)
+    except ParamError as error:
+        raise typer.BadParameter(str(error)) from None
+    return size
 
 
-def _texture(text: str) -> dict[str, Any]:
-    """`orm.png,channel=g,uv_scale=4` as a material file's table; what is no option belongs to the file's name."""
-    from nma.materials import TEXTURE_OPTIONS
-
-    file, *parts = re.split(rf",(?=(?:{'|'.join(TEXTURE_OPTIONS)})=)", text)
-    return {"texture": file} | {key: _option(value) for key, _, value in (p.partition("=") for p in parts)}
-
-
-def _option(text: str) -> Any:
-    try:
-        return float(text)
-    except ValueError:
-        return {"true": True, "false": False}.get(text, text)
+def refuse(context: typer.Context, names: tuple[str, ...], subject: str) -> None:
+    """An option that would do nothing is a mistake."""
+    given = [name for name in names if _given(context, name)]
+    if given:
+        flags = ", ".join("--set" if name == "changes" else f"--{name.replace('_', '-')}" for name in given)
+        raise typer.BadParameter(f"{flags} cannot be used with {subject}")
 
 
-def assignment(text: str) -> tuple[str, str]:
-    """Name and value of `NAME=VALUE`."""
-    name, equals, value = text.partition("=")
-    if not (equals and name and value):
-        raise typer.BadParameter(f"'{text}' is not of the form NAME=VALUE")
-    return name.strip(), value.strip()
+def _given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"

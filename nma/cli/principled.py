@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from nma import files
-from nma.cli import console, options
+from nma.cli import console, options, reading
 
 # Mean error of the directional albedo above which plain numbers come with a warning: it shows in pictures.
 ALBEDO_LIMIT = 0.05
@@ -54,11 +54,10 @@ def principled(
     """
     if output is not None:
         files.try_file(output)
-    from nma.cli.material import tables_of
     from nma.export.mitsuba import principled_dict, principled_xml
     from nma.train.constant import CONSTANT, fit_constant
 
-    tables, record = tables_of(source, material, walks, seed)
+    tables, record = reading.tables_of(source, material, walks, seed)
     recipe = replace(CONSTANT, seed=seed)
     if steps is not None:
         recipe = replace(recipe, steps=steps)

@@ -10,15 +10,37 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from nma.cli import console
-from nma.errors import SourceError, TableError
+from nma.errors import ParamError, SourceError, TableError
 from nma.files import arrays
 
 if TYPE_CHECKING:
+    from nma.materials import Material
     from nma.sources.base import Values
     from nma.table import Tables
 
 
-def read(
+def material_of(name: str, changes: list[str] | None) -> Material:
+    """A named material, a material file, or an adapter that knows a single one; with `changes` given by --set."""
+    from nma import materials
+    from nma.adapter import Adapter
+    from nma.params import MEASURED
+
+    if name.endswith(".safetensors"):
+        # An adapter that knows a single material is one.
+        adapter = Adapter.load(name)
+        if adapter.space.size and adapter.material is None:
+            raise ParamError(
+                f"{name} is an adapter of the whole class {adapter.space.name}; "
+                f"name a material, too: nma render MATERIAL --adapter {name}"
+            )
+        if adapter.material is not None:
+            return materials.Material.of_vector(Path(name).stem, adapter.material, adapter.space)
+        return materials.Material(Path(name).stem, name, "", MEASURED.name, {})
+    material = materials.load(name)
+    return material.changed(dict(map(change_of, changes)), "--set") if changes else material
+
+
+def known_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Values | Tables, dict[str, Any]]:
     """What is known of one material, its values or its table, and the record of where that comes from.
@@ -43,12 +65,12 @@ def read(
 def tables_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Tables, dict[str, Any]]:
-    """The isotropic table of one material, and the record, as of `read`, with the number of `points_per_bin` where
+    """The isotropic table of one material, and the record, as of `known_of`, with the number of `points_per_bin` where
     values were averaged over bins. Raises `SourceError` for anisotropic materials."""
     from nma.table import Tables
     from nma.table.values import POINTS, tabulate_values
 
-    known, record = read(source, material, walks, seed)
+    known, record = known_of(source, material, walks, seed)
     if isinstance(known, Tables):
         return known, record
     if not known.isotropic:
@@ -147,3 +169,36 @@ def _holds_tables(path: Path) -> bool:
             return "weights" not in f
     except Exception:  # whoever reads it says what is wrong
         return True
+
+
+def change_of(text: str) -> tuple[str, Any]:
+    """`alpha_top=.2` and the like, as in a material file."""
+    name, value = assignment(text)
+    try:
+        numbers = [float(part) for part in value.split(",")]
+        return name, numbers if len(numbers) > 1 else numbers[0]
+    except ValueError:
+        return name, value if name == "conductor" or value.startswith("#") else _texture(value)
+
+
+def _texture(text: str) -> dict[str, Any]:
+    """`orm.png,channel=g,uv_scale=4` as a material file's table; what is no option belongs to the file's name."""
+    from nma.materials import TEXTURE_OPTIONS
+
+    file, *parts = re.split(rf",(?=(?:{'|'.join(TEXTURE_OPTIONS)})=)", text)
+    return {"texture": file} | {key: _option(value) for key, _, value in (p.partition("=") for p in parts)}
+
+
+def _option(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return {"true": True, "false": False}.get(text, text)
+
+
+def assignment(text: str) -> tuple[str, str]:
+    """Name and value of `NAME=VALUE`."""
+    name, equals, value = text.partition("=")
+    if not (equals and name and value):
+        raise typer.BadParameter(f"'{text}' is not of the form NAME=VALUE")
+    return name.strip(), value.strip()

@@ -1,4 +1,4 @@
-"""`nma info`, `doctor`: what a weights file says, and what the machine lacks."""
+"""`nma info`: what a weights file says about itself."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ _ABOUT_THE_LOSS = (
 
 def register(app: typer.Typer) -> None:
     app.command()(info)
-    app.command()(doctor)
 
 
 def info(
@@ -61,21 +60,6 @@ def info(
     if {"dataset", "walks_per_material"} & set(adapter.training):
         console.out.print()
         console.out.print(_ABOUT_THE_LOSS, highlight=False)
-
-
-def doctor() -> None:
-    """Check that everything the package needs is there; print the command that mends what is not."""
-    from nma.doctor import check
-
-    findings = check()
-    rows = [(f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found) for f in findings]
-    console.out.print(console.table(("what", "state", "found"), rows))
-    # Commands stand alone, unbroken, to be copied.
-    for f in findings:
-        if not f.ok:
-            console.tell(f"\n{f.name}:\n  {f.fix}")
-    if not all(f.ok or f.optional for f in findings):
-        raise typer.Exit(1)
 
 
 def _plain(value: Any) -> str:

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from nma import progress
-from nma.cli import console, simulate
+from nma.cli import console
 from nma.evaluate.metrics import FIGURES
 from nma.train import fit
 from nma.train.recipe import SINGLE
@@ -79,12 +79,6 @@ def test_what_commands_print_fits_the_terminal(nma, monkeypatch, width):
         assert max(map(len, out.splitlines())) <= width, words
 
 
-def test_the_loss_of_training_is_told_from_the_error_of_the_adapter(nma):
-    _, out, _ = nma("info", "layered3-5x64")
-    assert "log_loss_of_last_1000_steps  .01036" in out
-    assert "holds their noise too" in " ".join(out.split())
-
-
 def test_a_fit_shows_a_bar_on_terminals_alone_and_none_if_told(monkeypatch):
     class Bar:
         made = 0
@@ -116,23 +110,3 @@ def test_the_bar_of_a_short_training_is_full_at_its_end(monkeypatch):
     with progress.TrainingBar(SimpleNamespace(steps=30, bins_per_step=1)) as bar:
         bar.update(SimpleNamespace(step=30, log_losses=[0.1]))
     assert "30/30" in progress.err.file.getvalue()
-
-
-def test_a_dataset_says_how_long_it_will_take(nma, tmp_path):
-    code, _, err = nma("dataset", "layered3", tmp_path / "x.zarr", "--materials", 2, "--walks", 1600)
-    assert code == 0
-    assert "to go at" in err and "million walks per second" in err
-    assert [simulate._span(s) for s in (5, 300, 9000, 1e6)] == [
-        "5 seconds",
-        "5.0 minutes",
-        "2.5 hours",
-        "11.6 days",
-    ]
-
-
-def test_paths_are_printed_as_they_are(nma, tmp_path):
-    """On lines as long as they need, brackets and all."""
-    path = tmp_path / "a folder [bold] of {many} letters in its name" / ("n" * 60 + "[/x].npz")
-    code, _, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", path)
-    assert code == 0
-    assert f"{path}: 1 material(s), 1,600 walks each\n" in err

@@ -1,0 +1,48 @@
+"""`nma demo`: reference and adapter side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nma import files
+from nma.cli import console, options, preview
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(demo)
+
+
+def demo(
+    output: Annotated[Path, options.output("The PNG to write.", ".png")] = Path("out/demo.png"),
+    adapter: options.AdapterName = "layered3-5x64",
+    size: options.Size = "256",
+    spp: Annotated[int, options.samples("Samples per pixel of the frames that are timed.")] = 64,
+    runs: Annotated[int, options.number("Frames of each kind, with seeds of their own.", 2, 1000)] = 2,
+    reference_spp: Annotated[int, options.samples("Samples per pixel of the converged reference.")] = 144,
+    variant: options.MitsubaVariant = "auto",
+) -> None:
+    """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.
+
+    Writes a sheet of pictures as soon as there are some, again whenever there is more to show, and prints the table
+    below it. Takes about a minute on two CPU cores.
+    """
+    from nma.images import metrics
+
+    metrics.ensure_libraries(ssim=False)
+    files.try_file(output)
+    from nma.adapter import Adapter
+    from nma.render import demo as demonstration
+
+    metrics.check_size(preview.pixels(size))
+    Adapter.load(adapter)
+    settings = demonstration.Settings(preview.pixels(size), spp, runs, reference_spp, adapter)
+    preview.use_rgb(variant)
+    with preview.samples_bar("demo", demonstration.total_samples(settings)) as advance:
+        lines = demonstration.demo(output, settings, advance, lambda shown: console.say(f"{output}: {shown}"))
+    for material in dict.fromkeys(line.material for line in lines):
+        rows = [line.cells()[1:] for line in lines if line.material == material]
+        console.out.print(console.table(demonstration.HEADINGS[1:], rows, material))
+    console.out.print(demonstration.note(settings), highlight=False)

@@ -1,0 +1,26 @@
+"""`nma doctor`: what this machine lacks."""
+
+from __future__ import annotations
+
+import typer
+
+from nma.cli import console
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(doctor)
+
+
+def doctor() -> None:
+    """Check that everything the package needs is there; print the command that mends what is not."""
+    from nma.doctor import check
+
+    findings = check()
+    rows = [(f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found) for f in findings]
+    console.out.print(console.table(("what", "state", "found"), rows))
+    # Commands stand alone, unbroken, to be copied.
+    for f in findings:
+        if not f.ok:
+            console.tell(f"\n{f.name}:\n  {f.fix}")
+    if not all(f.ok or f.optional for f in findings):
+        raise typer.Exit(1)

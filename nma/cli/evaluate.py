@@ -1,0 +1,61 @@
+"""`nma evaluate`: an adapter against reference tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nma.cli import console, options
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(evaluate)
+
+
+def evaluate(
+    weights: Annotated[str, typer.Argument(help="A weights file or the name of a shipped adapter.")],
+    reference: Annotated[Path, typer.Option(help="A reference file made by `nma simulate`.")],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
+    ] = False,
+    clamp: options.Clamp = False,
+) -> None:
+    """Compare an adapter with reference tables over the paper's bins: means over bins and RGB, then over materials.
+
+    The adapter's own bin averages are integrated with points in every bin and samples of its narrow lobes; the line
+    below the table says how exact they are. See docs/evaluation.md for every figure's formula.
+    """
+    from nma.adapter import Adapter
+    from nma.evaluate import evaluate as run
+    from nma.evaluate.metrics import FIGURES
+    from nma.table import Tables
+
+    adapter = Adapter.load(weights)
+    tables = Tables.load(reference)
+    with console.counting("evaluating", len(tables.params), "materials/s", digits=2) as show:
+        result = run(adapter, tables, lambda done: show(done, done), clamp=clamp)
+    if as_json:
+        print(json.dumps({"mean": _finite(result.mean), "materials": [_finite(m) for m in result.materials]}))
+        return
+    rows = [(str(n), *(m[f] for f in FIGURES)) for n, m in enumerate(result.materials)]
+    rows.append(("mean", *(result.mean[f] for f in FIGURES)))
+    console.out.print(
+        console.table(("material", *FIGURES), rows, f"{weights} ({adapter.variant}) against {reference}")
+    )
+    console.out.print(
+        f"The adapter's bin averages are exact to {result.integration_error:.1e} in log loss, "
+        f"its albedos to {result.albedo_integration_error:.1e}."
+    )
+    if result.estimated_error:
+        console.out.print(
+            "The reference has no standard errors; its noise floor is an upper bound from counting walks."
+        )
+
+
+def _finite(figures: dict[str, float]) -> dict[str, float | None]:
+    """The figures for JSON, which has no infinity: the PSNR of equal tables becomes null."""
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}

@@ -1,0 +1,80 @@
+"""`nma materials`: the named materials, and what a material file says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nma.cli import console
+
+if TYPE_CHECKING:
+    from nma.materials import Material, Texture
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(materials)
+
+
+def materials(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Show this material's parameters, or those of a material file (.toml)."),
+    ] = None,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print JSON on stdout and nothing else there: all digits, for programs."),
+    ] = False,
+) -> None:
+    """List the named materials, or show one of them."""
+    from nma import materials as named
+
+    if name is None:
+        known = [named.load(n) for n in named.names()]
+        if as_json:
+            print(json.dumps([_facts(m) for m in known]))
+            return
+        listed = [(m.name, m.title, m.description) for m in known]
+        console.out.print(console.table(("name", "title", "description"), listed))
+        return
+    material = named.load(name)
+    if as_json:
+        print(json.dumps(_facts(material)))
+        return
+    rows = [
+        (p.name, p.symbol, f"{p.low:g} .. {p.high:g}", _show(material.values[p.name]))
+        for p in material.space.params
+    ]
+    console.out.print(
+        console.table(
+            ("parameter", "symbol", "range", "value"), rows, f"{material.title}: {material.description}"
+        )
+    )
+
+
+def _facts(material: Material) -> dict[str, Any]:
+    """A material for other programs: its vector in the order of the class, null where images drive it, and by name."""
+    from nma.materials import Texture
+
+    values = {
+        name: {**asdict(value), "parameter": name, "path": str(value.path)}
+        if isinstance(value, Texture)
+        else value
+        for name, value in material.values.items()
+    }
+    return {
+        "name": material.name,
+        "title": material.title,
+        "description": material.description,
+        "class": material.class_name,
+        "parameters": None if material.textures else material.vector().tolist(),
+        "values": values,
+    }
+
+
+def _show(value: float | tuple[float, ...] | Texture) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"{x:.4g}" for x in value)
+    return f"{value:.4g}" if isinstance(value, float) else value.path.name

@@ -1,0 +1,101 @@
+"""`nma train`: an adapter for a whole class."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nma import files
+from nma.cli import console, options, training
+
+
+def register(app: typer.Typer) -> None:
+    app.command()(train)
+
+
+def train(
+    class_name: Annotated[str, typer.Argument(help="The class to learn, layered3.")],
+    output: options.Weights,
+    data: Annotated[Path | None, typer.Option(help="A dataset made by `nma dataset`.")] = None,
+    stream: Annotated[
+        int,
+        options.number(
+            "Without a dataset: keep this many fresh materials in memory, replaced as training goes on.",
+            0,
+            100_000,
+        ),
+    ] = 0,
+    walks: Annotated[int, options.walks("Walks per streamed material.")] = 819_200,
+    refresh: Annotated[
+        int, options.number("Steps between two exchanges of streamed materials.", 1, 10**9)
+    ] = 400,
+    preset: Annotated[
+        str, options.choice("Our recipe for classes, or the paper's.", "class", "paper")
+    ] = "class",
+    variant: options.Variant = "blended+omega_i",
+    instances: Annotated[
+        int | None, options.number("Principled instances in the blend, instead of the variant's.", 1, 5)
+    ] = None,
+    network: options.Network = None,
+    target: options.Target = None,
+    steps: options.Steps = None,
+    points: options.Points = None,
+    points_law: options.PointsLaw = None,
+    finest: options.Finest = None,
+    loss: options.Loss = None,
+    albedo: options.Albedo = None,
+    learning_rate: options.Rate = None,
+    seed: options.TrainingSeed = 0,
+) -> None:
+    """Train an adapter for a whole class. A killed run goes on from its checkpoint (OUTPUT.ckpt).
+
+    Example: [bold]nma dataset layered3 l3.zarr && nma train layered3 --data l3.zarr -o my.safetensors[/bold]
+    """
+    from nma import sources
+    from nma.train.recipe import preset as recipe_of
+    from nma.train.run import train_class
+
+    files.try_file(output)
+    checkpoint = output.with_name(output.name + ".ckpt")
+    files.try_file(checkpoint, console.loss_plot(output))
+    recipe = recipe_of(
+        preset,
+        **training.of_variant(variant, target, instances),
+        network=network,
+        steps=steps,
+        points=points,
+        points_law=points_law,
+        finest=finest,
+        loss=loss,
+        albedo=albedo,
+        learning_rate=learning_rate,
+        seed=seed,
+    )
+    space = sources.get(class_name).space
+    source, record = _training_data(class_name, data, stream, walks, recipe.seed)
+    with console.TrainingBar(recipe) as bar:
+        adapter, run = train_class(
+            space, recipe, source, record, checkpoint=checkpoint, refresh=refresh, progress=bar.update
+        )
+    training.finish(adapter, run, output)
+    checkpoint.unlink(missing_ok=True)
+
+
+def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
+    """(tables of a dataset, or the settings of a stream; record of their origin)."""
+    from nma.table.dataset import Dataset, Settings
+
+    if (data is None) == (stream == 0):
+        raise typer.BadParameter("give either --data DATASET or --stream MATERIALS")
+    if data is None:
+        settings = Settings(class_name, stream, walks, seed)
+        return settings, {"data": "stream", "dataset": asdict(settings)}
+    dataset = Dataset.open(data)
+    if dataset.settings.class_name != class_name:
+        raise typer.BadParameter(f"{data} holds class {dataset.settings.class_name}, not {class_name}")
+    with console.err.status(f"reading {dataset.settings.materials} tables"):
+        tables = dataset.load()
+    return tables, {"data": "dataset", "dataset": asdict(dataset.settings)}

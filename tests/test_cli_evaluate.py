@@ -1,0 +1,35 @@
+"""`nma evaluate` prints figures for people and for programs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from nma.cli.evaluate import _finite
+from nma.evaluate.metrics import FIGURES
+
+
+def test_simulate_and_evaluate_print_one_json_object_and_nothing_else(nma, untrained, tmp_path):
+    drawn, again = tmp_path / "drawn.npz", tmp_path / "again.npz"
+    assert nma("simulate", "--draw", 2, "--walks", 16_000, "--seed", 3, "-o", drawn)[0] == 0
+    code, out, _ = nma("simulate", "--params", drawn, "--walks", 16_000, "--seed", 3, "-o", again)
+    assert (code, out) == (0, "")
+    with np.load(drawn) as one, np.load(again) as two:
+        assert one["params"].shape == (2, 13)
+        for name in ("params", "table", "walks", "error"):
+            np.testing.assert_array_equal(one[name], two[name])
+    code, out, _ = nma("evaluate", untrained, "--reference", again, "--json")
+    assert code == 0
+    result = json.loads(out)
+    assert set(result) == {"mean", "materials"}
+    assert len(result["materials"]) == 2
+    for figures in (result["mean"], *result["materials"]):
+        assert tuple(figures) == FIGURES
+        assert np.isfinite(list(figures.values())).all()
+    for name in FIGURES:
+        assert result["mean"][name] == pytest.approx(np.mean([m[name] for m in result["materials"]]))
+
+
+def test_json_has_no_infinity():
+    """The PSNR of equal tables is infinite."""
+    assert _finite({"psnr": float("inf"), "ae": 0.0}) == {"psnr": None, "ae": 0.0}

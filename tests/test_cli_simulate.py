@@ -1,0 +1,66 @@
+"""`nma simulate` writes reference files, and goes on where it was stopped."""
+
+import errno
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from nma import table
+from nma.table import Tables
+
+
+def test_paths_are_printed_as_they_are(nma, tmp_path):
+    """On lines as long as they need, brackets and all."""
+    path = tmp_path / "a folder [bold] of {many} letters in its name" / ("n" * 60 + "[/x].npz")
+    code, _, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", path)
+    assert code == 0
+    assert f"{path}: 1 material(s), 1,600 walks each\n" in err
+
+
+def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, monkeypatch):
+    save = np.savez_compressed
+
+    def fills_up(file, **arrays):
+        save(file, **arrays)
+        if not file.name.startswith(str(tmp_path / "x.npz.parts")):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fills_up)
+    code, out, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")
+    assert (code, out) == (1, "")
+    assert "nma: " in err.splitlines()[-1] and "No space left" in err.splitlines()[-1]
+    # What was simulated waits for the next run.
+    assert [path.name for path in tmp_path.iterdir()] == ["x.npz.parts"]
+    monkeypatch.undo()
+    monkeypatch.setattr(table, "tabulate", None)
+    assert nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")[0] == 0
+
+
+def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
+    output = tmp_path / "x.npz"
+    run = ("simulate", "--draw", 2, "--walks", 1600, "--seed", 5, "-o")
+    assert nma(*run, tmp_path / "right.npz")[0] == 0
+    parts = tmp_path / "x.npz.parts"
+    parts.mkdir()
+    for key in table.stream_keys(5, range(2)):
+        (parts / f"{key:016x}-1600.npz").write_bytes(b"PK\x03\x04damaged")
+    code, _, err = nma(*run, output)
+    assert code == 0, err
+    np.testing.assert_array_equal(Tables.load(output).values, Tables.load(tmp_path / "right.npz").values)
+    assert not parts.exists()
+
+
+def test_parts_that_another_run_takes_away_do_no_harm(nma, tmp_path, monkeypatch):
+    """Two runs into one output: the first that ends removes the folder, while the other is about to name a file."""
+    replace, taken = Path.replace, []
+
+    def without_folder(self, target):
+        if not taken:
+            taken.append(shutil.rmtree(tmp_path / "x.npz.parts"))
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", without_folder)
+    code, _, err = nma("simulate", "--draw", 2, "--walks", 1600, "-o", tmp_path / "x.npz")
+    assert code == 0, err
+    assert taken and [path.name for path in tmp_path.iterdir()] == ["x.npz"]
