@@ -37,7 +37,7 @@ def simulate(
         str, options.choice("Where drawn conductors come from.", *options.POPULATIONS)
     ] = "mixed",
     class_name: Annotated[
-        str, typer.Option("--class", help="The class of the source materials.")
+        str, typer.Option("--class", help="The class of --params and --draw.")
     ] = "layered3",
     walks: Annotated[int, options.walks("Random walks per material.")] = 16_000_000,
     seed: Annotated[int, options.seed("Seed of the walks and of the drawn materials.")] = 0,
@@ -55,7 +55,7 @@ def simulate(
     # Finished materials wait beside the output, so that a killed run goes on where it stopped.
     parts = output.with_name(output.name + ".parts")
     files.try_folder(parts)
-    source = sources.get(class_name)
+    source = sources.get(_class_of(material) if material else class_name)
     vectors = _vectors(source.space, params, material, draw, population, seed)
     tables: list[Tables] = []
     walked = 0
@@ -73,6 +73,18 @@ def simulate(
     Tables.concatenate(tables).save(output)
     shutil.rmtree(parts, ignore_errors=True)
     console.say(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
+
+
+def _class_of(names: list[str]) -> str:
+    """The class of all these materials."""
+    from nma import materials
+
+    classes = sorted({materials.load(name).class_name for name in names})
+    if len(classes) > 1:
+        raise typer.BadParameter(
+            f"materials of the classes {', '.join(classes)}; simulate one class at a time"
+        )
+    return classes[0]
 
 
 def _vectors(space, params, material, draw, population, seed):

@@ -55,13 +55,15 @@ def train(
     Example: [bold]nma dataset layered3 l3.zarr && nma train layered3 --data l3.zarr -o my.safetensors[/bold]
     """
     from nma import sources
-    from nma.train.recipe import preset as recipe_of
+    from nma.train.recipe import for_class
     from nma.train.run import train_class
 
     files.try_file(output)
     checkpoint = output.with_name(output.name + ".ckpt")
     files.try_file(checkpoint, console.loss_plot(output))
-    recipe = recipe_of(
+    space = sources.get(class_name).space
+    recipe = for_class(
+        space,
         preset,
         **training.of_variant(variant, target, instances),
         network=network,
@@ -74,7 +76,6 @@ def train(
         learning_rate=learning_rate,
         seed=seed,
     )
-    space = sources.get(class_name).space
     source, record = _training_data(class_name, data, stream, walks, recipe.seed)
     with console.TrainingBar(recipe) as bar:
         adapter, run = train_class(

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from nma import network
+from nma.adapter import encoding
 from nma.errors import NmaError
+from nma.params import SPACES, ParamSpace
 from nma.table import ISOTROPIC, Grid
 from nma.table.quadrature import FINEST
 
@@ -160,3 +162,14 @@ def preset(name: str, **changes) -> Recipe:
     if name not in PRESETS:
         raise NmaError(f"unknown preset '{name}'; known are {', '.join(PRESETS)}")
     return replace(PRESETS[name], **{k: v for k, v in changes.items() if v is not None})
+
+
+def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
+    """The preset `name` for a class, as `preset` with `changes`.
+
+    An encoding that is named after another class becomes the encoding of this class, or `raw` if it has none.
+    """
+    recipe = preset(name, **changes)
+    if recipe.encoding not in SPACES:
+        return recipe
+    return replace(recipe, encoding=space.name if space.name in encoding.ENCODERS else "raw")

@@ -1,0 +1,78 @@
+"""A second class of materials is its parameters, its source and a line in each registry; everything else follows."""
+
+import numpy as np
+import pytest
+
+from nma import sources
+from nma.adapter import Adapter
+from nma.export import classes
+from nma.params import LAYERED3, SPACES, Param, ParamSpace
+from nma.sources.layered import Layered3
+from nma.table import Tables
+from nma.train.recipe import CLASS, PAPER, for_class
+
+BARE = ParamSpace(
+    "bare",
+    (
+        Param("alpha", "a", "log10", 1e-2, 1.0, 1e-4, 1.0, "microfacet width"),
+        Param("tint", "t", "uniform", 0.0, 1.0, 0.0, 1.0, "colour of the medium", 3),
+    ),
+)
+MATERIAL = 'title = "Steel"\ndescription = "Bare."\nclass = "bare"\n[parameters]\nalpha = 0.2\ntint = [0.5, 0.6, 0.7]\n'
+
+
+class Bare(Layered3):
+    """A stack of which two parameters vary."""
+
+    space = BARE
+
+    def gather(self, columns):
+        alpha, *tint = columns
+        constant = lambda *values: [0.0 * alpha + value for value in values]
+        metal = constant(0.2, 0.2, 0.2, 3.0, 3.0, 3.0)
+        return super().gather([alpha, alpha, *constant(1.5), *metal, *tint, *constant(0.5)])
+
+
+@pytest.fixture
+def bare(monkeypatch, tmp_path):
+    """The class in its registries, and a material of it as a file."""
+    monkeypatch.setitem(SPACES, "bare", BARE)
+    monkeypatch.setitem(sources._FACTORIES, "bare", Bare)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "steel.toml").write_text(MATERIAL)
+    return tmp_path / "steel.toml"
+
+
+def test_a_class_trains_with_its_own_encoding_or_with_its_plain_parameters():
+    assert for_class(LAYERED3) == CLASS
+    assert for_class(BARE, steps=10).encoding == "raw"
+    assert for_class(BARE, "paper") == PAPER
+    assert for_class(BARE, "single").encoding == "direction"
+
+
+def test_simulate_takes_the_class_of_the_material(bare, nma):
+    assert nma("simulate", "--material", bare, "--walks", "20000", "-o", "steel.npz")[0] == 0
+    assert Tables.load("steel.npz").params.shape == (1, 4)
+    code, _, told = nma("simulate", "--material", bare, "--material", "wet-nickel", "-o", "two.npz")
+    assert code == 2
+    assert "classes bare, layered3" in told
+
+
+def test_cpp_gets_the_parameters_of_the_class(bare):
+    assert "bare_parameters()" in classes()
+
+
+@pytest.mark.slow
+def test_a_class_is_sampled_trained_judged_and_prepared(bare, nma):
+    for words in (
+        "dataset bare bare.zarr --materials 4 --walks 20000",
+        "train bare --data bare.zarr -o bare.safetensors --steps 20 --network 1x8",
+        f"simulate --material {bare} --walks 20000 -o steel.npz",
+        "evaluate bare.safetensors --reference steel.npz",
+        f"render {bare} --adapter bare.safetensors --size 8 --spp 1 -o steel.png",
+    ):
+        code, _, told = nma(*words.split())
+        assert code == 0, (words, told)
+    adapter = Adapter.load("bare.safetensors")
+    assert (adapter.space, adapter.encoding) == (BARE, "raw")
+    assert np.isfinite(adapter.numbers(BARE.sample(np.random.default_rng(0), 3), [0.2, 0.9])).all()
