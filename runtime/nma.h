@@ -89,7 +89,6 @@ struct Options {
 
 class Adapter {
 public:
-    static constexpr const char* DIALECT = "mitsuba-principled-reflection";
     // Queries that `prepare_many` works on at once.
     static constexpr int BLOCK = 24;
 
@@ -218,33 +217,14 @@ private:
     // Whether a material may have x for its parameter number `k`.
     bool knows(int k, float x) const {
         if (material().empty()) return parameter(k).allows(x);
-        return is_finite(x) && absolute(x - material()[k]) <= 1e-5f * absolute(material()[k]) + 1e-8f;
+        return same(x, material()[k]);
     }
 
     // Remembers which fields of a `Principled` the numbers of a parameter become.
     void add_fields(const TargetParam& p) {
-        using P = Principled<float>;
-        static constexpr std::pair<const char*, std::size_t> FIELDS[] = {
-            {"base_color", offsetof(P, base_color)},
-            {"roughness", offsetof(P, roughness)},
-            {"metallic", offsetof(P, metallic)},
-            {"specular", offsetof(P, specular)},
-            {"spec_tint", offsetof(P, spec_tint)},
-            {"sheen", offsetof(P, sheen)},
-            {"sheen_tint", offsetof(P, sheen_tint)},
-            {"clearcoat", offsetof(P, clearcoat)},
-            {"clearcoat_gloss", offsetof(P, clearcoat_gloss)},
-            {"anisotropic", offsetof(P, anisotropic)},
-            {"flatness", offsetof(P, flatness)},
-            {"fade", offsetof(P, fade)},
-            {"fade_width", offsetof(P, fade_width)}};
         in_plane_ |= p.in_plane;
-        for (const auto& [name, offset] : FIELDS)
-            if (p.name == name && p.size == (p.name == "base_color" ? 3 : 1)) {
-                for (int c = 0; c < p.size; ++c) fields_.push_back(static_cast<int>(offset / sizeof(float)) + c);
-                return;
-            }
-        throw Error("unknown target parameter '" + p.name + "'; upgrade the runtime");
+        const int first = static_cast<int>(detail::field(p.name, p.size).first);
+        for (int c = 0; c < p.size; ++c) fields_.push_back(first + c);
     }
 
     // Refuses a network that does not fit its own description, or this version's target.
@@ -330,8 +310,9 @@ private:
 // Of isotropic adapters only.
 class Curves {
 public:
-    // As many as nma/render/curves.py has.
+    // As many as nma/render/curves.py has, and the cosine that it takes for those below.
     static constexpr int NODES = 128;
+    static constexpr float MIN_COS = 1e-4f;
 
     // Throws `Error` for anisotropic adapters.
     Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
@@ -340,7 +321,7 @@ public:
                 "an anisotropic adapter has no curves, as the azimuth of the view matters; prepare by direction");
         for (int n = 0; n < std::max(nodes, 2); ++n) {
             const float cosine = static_cast<float>(n) / static_cast<float>(std::max(nodes, 2) - 1);
-            nodes_.push_back(adapter.prepare(parameters, maximum(cosine, 1e-4f)));
+            nodes_.push_back(adapter.prepare(parameters, maximum(cosine, MIN_COS)));
         }
     }
 

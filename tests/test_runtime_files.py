@@ -17,8 +17,8 @@ from adapter_cases import random_adapter
 
 from nma.adapter import Adapter
 from nma.errors import ParamError, WeightsError
-from nma.export.classes import classes
-from nma.export.cpp import cpp, print_function
+from nma.export import FILES
+from nma.export.cpp import print_function
 from nma.export.functions import Unsupported, parsed
 from nma.native.runtime import Runtime
 from nma.params import LAYERED3
@@ -200,9 +200,9 @@ def test_weights_of_one_material_know_which(tmp_path):
     assert Runtime(path).material is None
 
 
-def test_the_generated_headers_are_those_of_the_present_package():
-    assert (ROOT / "runtime/nma/target.h").read_text() == cpp(), "run `python -m nma.export`"
-    assert (ROOT / "runtime/nma/classes.h").read_text() == classes(), "run `python -m nma.export`"
+@pytest.mark.parametrize("name", FILES)
+def test_the_generated_headers_are_those_of_the_present_package(name):
+    assert (ROOT / "runtime" / name).read_text() == FILES[name](), "run `python -m nma.export`"
 
 
 def module_of(text, path: Path) -> ModuleType:

@@ -33,7 +33,7 @@ from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
 # Parameters that differ by less, relative to their size, are of the same material: rounding to single precision.
-_SAME = 1e-5
+SAME = 1e-5
 
 
 def shipped() -> tuple[str, ...]:
@@ -163,7 +163,7 @@ class Adapter:
             )
         given = self.space.check(params)
         for name, columns in self.space.slices.items():
-            other = ~np.isclose(given[:, columns], known[columns], rtol=_SAME).all(axis=1)
+            other = ~np.isclose(given[:, columns], known[columns], rtol=SAME).all(axis=1)
             if other.any():
                 raise ParamError(
                     f"the adapter knows a single material, {self.training.get('material', 'that of its fit')}, whose "

@@ -21,7 +21,9 @@ Tangent = tuple[Float, Float]
 Encoder = Callable[..., list[Float]]
 
 # Cosine of 84 degrees: where the reflectance of metals dips before it rises to 1.
-_GRAZING = 0.1045
+GRAZING = 0.1045
+# Cosines of refraction below are taken for this one.
+MIN_COS_T = 0.05
 
 
 def raw(columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None) -> list[Float]:
@@ -62,12 +64,12 @@ def layered3(
         ("sigma_t", sigma_t),
     )
     unit = [LAYERED3[name].normalise(x) for name, x in ranged]
-    for cosine in (1.0, _GRAZING):
+    for cosine in (1.0, GRAZING):
         unit += [fresnel_conductor(cosine, e / eta_top, x / eta_top) for e, x in zip(eta, k, strict=True)]
     unit += albedo
     if cos_theta_i is not None:
         fresnel, cos_t = fresnel_dielectric(cos_theta_i, eta_top)
-        unit += [cos_theta_i, fresnel, ops.exp(-sigma_t / ops.maximum(cos_t, 0.05))]
+        unit += [cos_theta_i, fresnel, ops.exp(-sigma_t / ops.maximum(cos_t, MIN_COS_T))]
     return [2.0 * x - 1.0 for x in unit]
 
 

@@ -2,5 +2,9 @@
 
 from nma.export.classes import classes
 from nma.export.cpp import cpp
+from nma.export.shared import shared
 
-__all__ = ["classes", "cpp"]
+# The generated files of `runtime/`, and what prints them.
+FILES = {"nma/target.h": cpp, "nma/classes.h": classes, "nma/constants.h": shared}
+
+__all__ = ["FILES"]

@@ -3,11 +3,8 @@
 import sys
 from pathlib import Path
 
-from nma.export.classes import classes
-from nma.export.cpp import cpp
+from nma.export import FILES
 from nma.files import write_text
-
-FILES = {"nma/target.h": cpp, "nma/classes.h": classes}
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runtime")
 for name, generate in FILES.items():

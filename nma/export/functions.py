@@ -107,12 +107,13 @@ def constants() -> dict[str, float]:
 def structures() -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
     """Name, docstring and fields (name, type) of every structure."""
     for structure in STRUCTURES:
-        yield structure.__name__, inspect.getdoc(structure) or "", list(_annotations(structure).items())
+        yield structure.__name__, inspect.getdoc(structure) or "", fields(structure)
 
 
-def _annotations(structure: type) -> dict[str, str]:
+def fields(structure: type) -> list[tuple[str, str]]:
+    """Names and types of a structure's fields."""
     hints = structure.__annotations__.items()
-    return {name: str(getattr(hint, "__forward_arg__", hint)) for name, hint in hints}
+    return [(name, str(getattr(hint, "__forward_arg__", hint))) for name, hint in hints]
 
 
 def _names(function: Function) -> list[str]:

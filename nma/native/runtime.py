@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma.adapter import weights_file
+from nma.adapter.adapter import SAME
 from nma.errors import ParamError, WeightsError
 from nma.native import build
 
@@ -147,7 +148,7 @@ class Runtime:
         """Rows of parameters within the training range, or of the only material known."""
         rows = _rows("params", params, self.parameters)
         if self.material is not None:
-            other = ~np.isclose(rows, self.material, rtol=1e-5)
+            other = ~np.isclose(rows, self.material, rtol=SAME)
             if other.any():
                 row, column = np.argwhere(other)[0]
                 raise ParamError(

@@ -30,7 +30,7 @@ from nma.sources.layered import Layered3, Layers
 INDEX_MATCHED = 1e-3
 _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
 # Share of the cosine lobe beside the others before normalisation, for light that the other lobes do not expect.
-_LEAST_DIFFUSE = 0.03
+LEAST_DIFFUSE = 0.03
 
 
 def settle(layers: Layers) -> Layers:
@@ -254,7 +254,7 @@ def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     passes = (1.0 - fresnel) * ops.exp(-2.0 * layers.sigma_t / cos_t)
     bottom = passes * metal
     medium = (1.0 - fresnel - passes) * _mean(Color(*layers.albedo))
-    diffuse = _LEAST_DIFFUSE + 0.5 * (medium + bottom * trapped)
+    diffuse = LEAST_DIFFUSE + 0.5 * (medium + bottom * trapped)
     norm = 1.0 / (fresnel + bottom + diffuse)
     width = ops.sqrt(width2)
     return (fresnel * norm, bottom * norm, diffuse * norm), ops.clip(width, 1e-4, 1.0)

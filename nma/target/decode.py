@@ -82,7 +82,7 @@ MEASURED_PARAMS = (
 # The same for materials that know no plane of incidence but axes of their own: x and y of the surface.
 ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
-# What the Principled BRDF is defined for: the range of a parameter lies within. Others are numbers of 0 .. 1.
+# What fields of the Principled BRDF are defined for that are no numbers of 0 .. 1.
 _LIMITS = {
     "specular": (0.0, 12.0),  # from 12.5 on there is no such index of refraction
     "anisotropic": (-1e6, 1.0),
@@ -128,10 +128,15 @@ def _check(p: TargetParam) -> None:
         raise WeightsError(f"Target parameter {p} has no plane of incidence.")
     if type(p.low) not in (int, float) or type(p.high) not in (int, float):
         raise WeightsError(f"Target parameter {p} has a range that is no pair of numbers.")
-    low, high = _LIMITS.get(p.name, (0.0, 1.0))
+    low, high = limits(p.name)
     scaled = p.scale == "linear" or (p.scale == "log" and p.low > 0)
     if not (scaled and low <= p.low < p.high <= high):
         raise WeightsError(f"Target parameter {p} has no valid range within {low:g} .. {high:g}.")
+
+
+def limits(field: str) -> tuple[float, float]:
+    """What a field of `Principled` is defined for: the range of a parameter lies within."""
+    return _LIMITS.get(field, (0.0, 1.0))
 
 
 def instance_size(params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:

@@ -97,7 +97,7 @@ private:
         float numbers[MOST_PARAMETERS];
         given.at(dr::zeros<SurfaceInteraction3f>(), numbers);
         for (int c = 0; c < p.size; ++c)
-            if (nma::absolute(numbers[c] - known[c]) > 1e-5f * nma::absolute(known[c]) + 1e-8f)
+            if (!nma::same(numbers[c], known[c]))
                 Throw(
                     "the adapter knows a single material, whose %s is %g, not %g; fit one to that material, or take "
                     "the adapter of a class",
@@ -134,7 +134,7 @@ private:
     }
 
     nma::Brdf prepare(const SurfaceInteraction3f& si) const {
-        const float cosine = nma::clip(static_cast<float>(si.wi.z()), 1e-4f, 1.0f);
+        const float cosine = nma::clip(static_cast<float>(si.wi.z()), nma::Curves::MIN_COS, 1.0f);
         if (curves_ && inputs_.settled(si)) return curves_->at(cosine);
         float parameters[MOST_PARAMETERS];
         inputs_.at(si, parameters);

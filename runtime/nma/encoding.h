@@ -2,6 +2,7 @@
 // nma/adapter/encoding.py.
 #pragma once
 
+#include "constants.h"
 #include "kernels/macros.h"
 #include "lanes.h"
 #include "target.h"
@@ -16,14 +17,13 @@ public:
     explicit Encoding(const Weights& weights) : kind_(kind_named(weights.encoding)), directional_(weights.directional) {
         for (const SourceParam& p : weights.parameters) parameters_ += p.size;
         if (kind_ != Kind::Layered3) return;
-        if (parameters_ != 13 || weights.parameters.size() != 7)
-            throw Error("the encoding 'layered3' belongs to another class");
+        if (parameters_ != layered3::COLUMNS) throw Error("the encoding 'layered3' belongs to another class");
         int k = 0;
-        for (const SourceParam* p :
-             {&weights.parameters[0], &weights.parameters[1], &weights.parameters[2], &weights.parameters[6]}) {
-            log_.set(k, p->logarithmic);
-            start_.set(k, p->start);
-            per_range_.set(k++, p->per_range);
+        for (const char* name : {"alpha_top", "alpha_bottom", "eta_top", "sigma_t"}) {
+            const SourceParam& p = scalar(weights, name);
+            log_.set(k, p.logarithmic);
+            start_.set(k, p.start);
+            per_range_.set(k++, p.per_range);
         }
     }
 
@@ -79,6 +79,12 @@ private:
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
+    static const SourceParam& scalar(const Weights& weights, const char* name) {
+        for (const SourceParam& p : weights.parameters)
+            if (p.name == name && p.size == 1) return p;
+        throw Error("the encoding 'layered3' belongs to another class");
+    }
+
     // Four scalars, three colours, and in the fourth lanes of those what depends on the direction.
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
 
@@ -90,17 +96,17 @@ private:
 
     NMA_INLINE void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;
-        constexpr float GRAZING = 0.1045f;
-        const float sigma_t = p[12];
+        const float sigma_t = p[layered3::SIGMA_T], eta_top = p[layered3::ETA_TOP];
         // First what takes longest.
-        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, p[2]);
-        const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, 0.05f)), Four(-87.0f)));
-        const Four one(1.0f), inside(1.0f / p[2]);
-        const Four n = four(p + 3) * inside, k = four(p + 6) * inside, k2 = k * k, less = n - one, more = n + one;
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
+        const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, MIN_COS_T)), Four(-87.0f)));
+        const Four one(1.0f), inside(1.0f / eta_top);
+        const Four n = four(p + layered3::ETA_CONDUCTOR) * inside, k = four(p + layered3::K_CONDUCTOR) * inside;
+        const Four k2 = k * k, less = n - one, more = n + one;
         Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
         // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
-        Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + 9);
-        const Four plain{p[0], p[1], p[2], sigma_t};
+        Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + layered3::ALBEDO);
+        const Four plain{p[layered3::ALPHA_TOP], p[layered3::ALPHA_BOTTOM], eta_top, sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
         normal.set(3, directional_ ? cosine : 0.0f);
         grazing.set(3, directional_ ? fresnel : 0.0f);

@@ -12,6 +12,8 @@
 #include <utility>
 #include <vector>
 
+#include "constants.h"
+
 namespace nma {
 
 // What is wrong with a file, where, and what to do about it.
@@ -59,9 +61,6 @@ public:
     }
 
 private:
-    // Arrays and objects inside each other.
-    static constexpr int DEEPEST = 32;
-
     [[noreturn]] void fail(const char* what) const {
         throw Error("malformed JSON at byte " + std::to_string(place_) + ": " + what);
     }
@@ -119,7 +118,7 @@ private:
     }
 
     int deeper(int depth) const {
-        if (depth == DEEPEST) fail("nested too deep");
+        if (depth == MAX_DEPTH) fail("nested too deep");
         return depth + 1;
     }
 

@@ -7,20 +7,12 @@
 
 #include <cstdint>
 
+#include "constants.h"
 #include "target.h"
 
 namespace nma::layered {
 
 using Vec = Vec3<float>;
-
-// Walks whose brightest channel falls below this go on with a chance in proportion to it.
-constexpr float ROULETTE_THRESHOLD = 0.5f;
-// Chance to go on after total reflection.
-constexpr float TRAPPED_SURVIVAL = 0.999f;
-// A coat whose index is closer to 1 than this is taken as none.
-constexpr float INDEX_MATCHED = 1e-3f;
-// Share of the cosine lobe beside the others before normalisation.
-constexpr float LEAST_DIFFUSE = 0.03f;
 
 // Random numbers of O'Neill 2014, "PCG": 64 bits of state, 32 of output (XSH-RR).
 class Random {
@@ -52,11 +44,13 @@ struct Layers {
     Vec eta_bottom, k_bottom, albedo;
     float sigma_t;
 
-    // From the 13 numbers of the class `layered3`.
+    // From a vector of the class `layered3`.
     static Layers of(const float* p) {
-        const float eta = p[2] < 1.0f + INDEX_MATCHED ? 1.0f : p[2], inverse = 1.0f / eta;
-        const Vec eta_conductor{p[3], p[4], p[5]}, k_conductor{p[6], p[7], p[8]}, albedo{p[9], p[10], p[11]};
-        return {p[0], p[1], eta, eta_conductor * inverse, k_conductor * inverse, albedo, p[12]};
+        using namespace layered3;
+        const auto colour = [p](int first) { return Vec{p[first], p[first + 1], p[first + 2]}; };
+        const float eta = p[ETA_TOP] < 1.0f + INDEX_MATCHED ? 1.0f : p[ETA_TOP], inverse = 1.0f / eta;
+        return {p[ALPHA_TOP],   p[ALPHA_BOTTOM], eta, colour(ETA_CONDUCTOR) * inverse, colour(K_CONDUCTOR) * inverse,
+                colour(ALBEDO), p[SIGMA_T]};
     }
 };
 

@@ -3,6 +3,8 @@
 // One Principled BRDF of the dialect "mitsuba-principled-reflection", with bounds of its albedo. T is float or double.
 #pragma once
 
+#include <cstddef>
+
 #include "math.h"
 
 namespace nma {
@@ -80,6 +82,29 @@ template <class T>
 struct Plane {
     T cos_phi;
     T sin_phi;
+};
+
+// A field of `Principled`: its numbers from `first` on, counted in floats, and the range that it is defined for.
+struct Field {
+    const char* name;
+    std::size_t first;
+    int size;
+    double low, high;
+};
+constexpr Field FIELDS[] = {
+    {"base_color", offsetof(Principled<float>, base_color) / sizeof(float), 3, 0.0, 1.0},
+    {"roughness", offsetof(Principled<float>, roughness) / sizeof(float), 1, 0.0, 1.0},
+    {"metallic", offsetof(Principled<float>, metallic) / sizeof(float), 1, 0.0, 1.0},
+    {"specular", offsetof(Principled<float>, specular) / sizeof(float), 1, 0.0, 12.0},
+    {"spec_tint", offsetof(Principled<float>, spec_tint) / sizeof(float), 1, 0.0, 1.0},
+    {"sheen", offsetof(Principled<float>, sheen) / sizeof(float), 1, 0.0, 1.0},
+    {"sheen_tint", offsetof(Principled<float>, sheen_tint) / sizeof(float), 1, 0.0, 1.0},
+    {"clearcoat", offsetof(Principled<float>, clearcoat) / sizeof(float), 1, 0.0, 1.0},
+    {"clearcoat_gloss", offsetof(Principled<float>, clearcoat_gloss) / sizeof(float), 1, 0.0, 1.0},
+    {"anisotropic", offsetof(Principled<float>, anisotropic) / sizeof(float), 1, -1000000.0, 1.0},
+    {"flatness", offsetof(Principled<float>, flatness) / sizeof(float), 1, 0.0, 1.0},
+    {"fade", offsetof(Principled<float>, fade) / sizeof(float), 1, -1.0, 1.0},
+    {"fade_width", offsetof(Principled<float>, fade_width) / sizeof(float), 1, 0.0, 1000000.0},
 };
 
 // Density of microfacet normals per solid angle, times 1 over projected area [1/sr]. Heitz 2014, eq. 84.

@@ -8,8 +8,9 @@
 #include <fstream>
 #include <tuple>
 
+#include "constants.h"
 #include "json.h"
-#include "math.h"
+#include "target.h"
 
 namespace nma {
 
@@ -48,6 +49,9 @@ struct SourceParam {
     }
 };
 
+// Whether x is the number that is known of a material, but for its rounding to single precision.
+inline bool same(float x, float known) { return is_finite(x) && absolute(x - known) <= SAME * absolute(known) + 1e-8f; }
+
 struct Weights {
     std::string class_name, encoding, dialect;
     std::vector<SourceParam> parameters;
@@ -62,7 +66,6 @@ struct Weights {
 
 namespace detail {
 
-constexpr int FORMAT = 1;
 constexpr int WIDEST = 4096, DEEPEST = 64;
 // Ends of ranges lie no farther from 0.
 constexpr double FARTHEST = 1e6;
@@ -189,13 +192,11 @@ inline SourceParam source_param(const Json& entry) {
     return p;
 }
 
-// What a Principled BRDF is defined for. Twin of _LIMITS in nma/target/decode.py.
-inline std::pair<double, double> limits(const std::string& name) {
-    if (name == "specular") return {0.0, 12.0};
-    if (name == "anisotropic") return {-FARTHEST, 1.0};
-    if (name == "fade") return {-1.0, 1.0};
-    if (name == "fade_width") return {0.0, FARTHEST};
-    return {0.0, 1.0};
+// What the Principled BRDF knows by this name and size.
+inline const Field& field(const std::string& name, int size) {
+    for (const Field& f : FIELDS)
+        if (f.name == name && f.size == size) return f;
+    throw Error("unknown target parameter '" + name + "'; upgrade the runtime");
 }
 
 inline TargetParam target_param(const Json& entry) {
@@ -206,8 +207,8 @@ inline TargetParam target_param(const Json& entry) {
     const std::string& scale = entry.at("scale", Json::Kind::String).string;
     p.logarithmic = scale == "log";
     p.in_plane = flag(entry, "in_plane");
-    const auto [least, most] = limits(p.name);
-    if (!(least <= p.low && p.low < p.high && p.high <= most) || (p.logarithmic && !(p.low > 0)))
+    const Field& known = field(p.name, p.size);
+    if (!(known.low <= p.low && p.low < p.high && p.high <= known.high) || (p.logarithmic && !(p.low > 0)))
         throw Error("target parameter '" + p.name + "' has no valid range");
     if (!p.logarithmic && scale != "linear")
         throw Error("target parameter '" + p.name + "' has the unknown scale '" + scale + "'");
