@@ -1,5 +1,6 @@
-// What tests/test_runtime.py calls beside the C interface: the target on arrays, in float and in double.
+// What tests of the runtime call beside the C interface: the target on arrays, in float and in double; what is in BRDFs.
 #include "nma.h"
+#include "nma_c.h"
 
 namespace {
 
@@ -51,4 +52,19 @@ void sample_double(int n, int count, const double* blends, const double* wi, con
         std::copy_n(row, 7, out);
     }
 }
+
+// Of BRDFs as the C interface makes them: the fields of all instances, then their weights.
+void brdf_numbers(int n, int count, const nma_brdf* brdfs, float* out) {
+    for (int i = 0; i < n; ++i, out += (FIELDS + 1) * count) {
+        const nma::Blend<float>& blend = reinterpret_cast<const nma::Brdf*>(brdfs + i)->blend();
+        for (int k = 0; k < count; ++k) {
+            const nma::Principled<float> instance = blend.instance(k);
+            std::memcpy(out + FIELDS * k, &instance, sizeof(instance));
+            out[FIELDS * count + k] = blend.weight(k);
+        }
+    }
+}
+
+int curve_nodes() { return nma::Curves::NODES; }
+float curve_min_cos() { return nma::Curves::MIN_COS; }
 }

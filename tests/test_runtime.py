@@ -2,12 +2,11 @@
 
 import ctypes
 import re
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 from density_cases import p_values
+from runtime_cases import built, facing, in_single_precision, pointer, rows
 from target_cases import random_blend, random_directions, stacked
 
 import nma
@@ -17,8 +16,6 @@ from nma.native.runtime import INSTRUCTION_SETS, Runtime, available
 from nma.ops import Vec3
 from nma.params import MEASURED
 
-ROOT = Path(__file__).parent.parent
-FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
 CASES = 4000
 # Numbers of an instance.
 FIELDS = len(target.Principled._fields) + 2
@@ -28,15 +25,7 @@ pytestmark = pytest.mark.usefixtures("compiler")
 
 @pytest.fixture(scope="module")
 def bridge(compiler, tmp_path_factory):
-    path = tmp_path_factory.mktemp("runtime") / "bridge.so"
-    source = ROOT / "tests/runtime_bridge.cpp"
-    command = [compiler, *FLAGS, f"-I{ROOT / 'runtime'}", "-shared", "-fPIC", source, "-o", path]
-    subprocess.run(command, check=True)
-    return ctypes.CDLL(str(path))
-
-
-def pointer(array):
-    return array.ctypes.data_as(ctypes.c_void_p)
+    return built(compiler, "runtime_bridge.cpp", tmp_path_factory.mktemp("runtime"))
 
 
 def flat(blend):
@@ -60,10 +49,6 @@ def cases(seed=0, count=2):
     h /= np.linalg.norm(h, axis=0)
     mirrored = 2.0 * (stacked(wi) * h).sum(axis=0) * h - stacked(wi)
     return blend, wi, Vec3(*np.where(near, mirrored, stacked(wo)))
-
-
-def rows(v):
-    return np.ascontiguousarray(stacked(v).T)
 
 
 @pytest.mark.parametrize("bounded", [False, True])
@@ -101,11 +86,6 @@ def test_samples_are_those_of_the_target(bridge):
     bridge.sample_double(CASES, 2, *(pointer(x) for x in (numbers, i, u, found)))
     wo, value, pdf = target.sample(blend, wi, *u.T)
     np.testing.assert_allclose(found, np.stack([*wo, *value, pdf], axis=-1), rtol=1e-6, atol=1e-9)
-
-
-def in_single_precision():
-    """Instruction sets of this CPU that compute in float32."""
-    return [name for name in available() if name != "avx512_bf16"]
 
 
 def rounded(layers):
@@ -148,7 +128,7 @@ def test_network_outputs_agree_on_every_instruction_set(name, compact):
 @pytest.mark.parametrize("name", nma.shipped())
 def test_single_queries_and_batches_make_the_same_materials(name):
     params, cosines = queries(6)
-    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
+    wi = facing(cosines)
     wo = rows(random_directions(np.random.default_rng(7), CASES)).astype(np.float32)
     for instruction_set in available():
         loaded = Runtime(name, instruction_set)
@@ -197,7 +177,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
 def test_curves_follow_the_network():
     """About to the error that nma/render/curves.py states of as many nodes, 1e-4 of a value."""
     params, cosines = queries(8)
-    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
+    wi = facing(cosines)
     u = np.random.default_rng(9).random((CASES, 3), np.float32)
     loaded = Runtime("layered3-5x64")
     library = loaded._library
@@ -218,7 +198,7 @@ def test_curves_follow_the_network():
 
 def test_samples_have_the_values_and_densities_of_eval():
     params, cosines = queries(10)
-    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
+    wi = facing(cosines)
     u = np.random.default_rng(11).random((CASES, 3), np.float32)
     loaded = Runtime("layered3-5x64")
     materials = loaded.prepare(params, cosines)
@@ -239,7 +219,7 @@ def test_samples_follow_the_density():
     params, cosines = queries(12)
     params, cosines = params[:tests], cosines[:tests]
     params[:, :2] = np.random.default_rng(13).uniform(0.1, 0.3, (tests, 2))
-    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1).astype(np.float32)
+    wi = facing(cosines).astype(np.float32)
     rng, loaded = np.random.default_rng(14), Runtime("layered3-5x64")
     materials = loaded.prepare(params, cosines)
     for k in range(tests):
@@ -260,7 +240,7 @@ def test_samples_follow_the_density():
 def test_albedos_are_the_means_of_samples_without_their_noise():
     params, cosines = queries(17)
     params, cosines, many = params[:10], np.linspace(0.02, 1.0, 10, dtype=np.float32), 1 << 15
-    wi = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
+    wi = facing(cosines)
     loaded = Runtime("layered3-3x32")
     materials = loaded.prepare(params, cosines)
     found = loaded.albedo(materials, wi)

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from adapter_cases import materials, random_anisotropic_adapter
-from target_cases import random_directions, stacked
+from runtime_cases import facing, pointer, rows
+from target_cases import random_directions
 
 import nma
 from nma import network, target
@@ -35,12 +36,7 @@ def case(request, tmp_path_factory):
 
 def directions(seed):
     """(n, 3), over the hemisphere."""
-    return np.ascontiguousarray(stacked(random_directions(np.random.default_rng(seed), CASES)).T, np.float32)
-
-
-def facing(cosines):
-    """Directions (n, 3) at azimuth 0."""
-    return np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
+    return rows(random_directions(np.random.default_rng(seed), CASES)).astype(np.float32)
 
 
 def outputs(adapter, wi):
@@ -64,10 +60,6 @@ def close(a, b, instruction_set):
     """The share of rows that agree; avx512_bf16 keeps eight bits of every activation."""
     rounded = instruction_set == "avx512_bf16"
     return np.isclose(a, b, rtol=0.1 if rounded else 2e-3, atol=2e-2 if rounded else 1e-4).all(axis=1).mean()
-
-
-def pointer(array):
-    return array.ctypes.data_as(ctypes.c_void_p)
 
 
 def test_network_outputs_are_those_of_the_package(case):

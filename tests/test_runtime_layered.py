@@ -1,12 +1,11 @@
 """The simulated material in C++: density and samples are the package's, samples follow it, walks have its mean."""
 
 import ctypes
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 from density_cases import p_values
+from runtime_cases import built, pointer
 from scipy.stats import norm
 from target_cases import random_directions, stacked
 
@@ -16,8 +15,6 @@ from nma.params import LAYERED3
 from nma.sources import layered_eval
 from nma.sources.layered import Layered3
 
-ROOT = Path(__file__).parent.parent
-FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
 GOLD = {"eta_conductor": (0.14, 0.37, 1.44), "k_conductor": (3.98, 2.38, 1.6), "albedo": (0.9, 0.3, 0.2)}
 CASES = {
     "lacquer": {"alpha_top": 0.1, "alpha_bottom": 0.3, "eta_top": 1.5, "sigma_t": 0.5},
@@ -41,18 +38,14 @@ def view(mu):
 
 @pytest.fixture(scope="module")
 def bridge(compiler, tmp_path_factory):
-    path = tmp_path_factory.mktemp("layered") / "bridge.so"
-    source = ROOT / "tests/layered_bridge.cpp"
-    command = [compiler, *FLAGS, f"-I{ROOT / 'runtime'}", "-shared", "-fPIC", source, "-o", path]
-    subprocess.run(command, check=True)
-    library = ctypes.CDLL(str(path))
+    library = built(compiler, "layered_bridge.cpp", tmp_path_factory.mktemp("layered"))
 
     def call(name, inputs, shape):
         """Calls the function for rows of outputs; it wants their number first where there are several."""
         out = np.empty(shape, np.float32)
         count = [ctypes.c_int(shape[0])] if name != "layered_albedo" else []
         arrays = [np.ascontiguousarray(a, np.float32) for a in inputs]
-        getattr(library, name)(*count, *(a.ctypes.data_as(ctypes.c_void_p) for a in (*arrays, out)))
+        getattr(library, name)(*count, *map(pointer, (*arrays, out)))
         return out
 
     return call

@@ -1,0 +1,138 @@
+"""What stands in Python and again in C++ by hand: each is bound case by case. CONTRIBUTING.md lists all twins."""
+
+import ctypes
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runtime_cases import built, in_single_precision, pointer, rows
+from target_cases import random_directions
+
+import nma
+from nma import Runtime
+from nma.adapter import encoding
+from nma.adapter.adapter import SAME
+from nma.native.runtime import _COMPACT, INSTRUCTION_SETS
+from nma.params import LAYERED3, LIBRARY, MEASURED
+from nma.render import curves
+from nma.target.decode import TARGETS, decode, output_size
+
+ROOT = Path(__file__).parent.parent
+CASES = 4000
+CLASS_OF = {"direction": MEASURED, "azimuth": MEASURED, "layered3": LAYERED3, "raw": LIBRARY}
+
+pytestmark = pytest.mark.usefixtures("compiler")
+
+
+@pytest.fixture(scope="module")
+def bridge(compiler, tmp_path_factory):
+    return built(compiler, "runtime_bridge.cpp", tmp_path_factory.mktemp("twins"))
+
+
+def saved(folder, space, name, instances, directional, params, matrix, bias):
+    """A weights file with a single linear layer."""
+    layers = [(matrix.astype(np.float32), bias.astype(np.float32))]
+    path = folder / "linear.safetensors"
+    nma.Adapter(space, name, layers, instances, directional, params).save(path)
+    return path
+
+
+def drawn(space, rng):
+    return space.sample(rng, CASES).astype(np.float32) if space.size else np.zeros((CASES, 0), np.float32)
+
+
+def views(rng):
+    """Directions, some of them at the pole and near the horizon."""
+    wi = rows(random_directions(rng, CASES)).astype(np.float32)
+    wi[:100] = (0.0, 0.0, 1.0)
+    wi[100:200, 2] = 1e-4
+    return wi / np.linalg.norm(wi, axis=1, keepdims=True).astype(np.float32)
+
+
+@pytest.mark.parametrize("instances", [1, 2, 3, 4, 5, 8])
+@pytest.mark.parametrize("name", TARGETS)
+def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, instances):
+    """Of random outputs, some of them far beyond what a sigmoid resolves."""
+    rng, size = np.random.default_rng(instances), output_size(instances, TARGETS[name])
+    matrix = rng.normal(size=(size, LIBRARY.size + 1)) * np.where(rng.random((size, 1)) < 0.1, 20.0, 0.5)
+    path = saved(tmp_path, LIBRARY, "raw", instances, True, TARGETS[name], matrix, rng.normal(size=size))
+    params, wi = drawn(LIBRARY, rng), views(rng)
+    for instruction_set in in_single_precision():
+        runtime = Runtime(path, instruction_set)
+        raw = runtime.outputs(params, wi).astype(np.float64)
+        assert (np.abs(raw) > 20).any() and (np.abs(raw) < 1).any()
+        blend = decode(list(raw.T), instances, TARGETS[name], wi[:, 2].astype(np.float64))
+        columns = [x for p in blend.instances for x in (*p.base_color, *p[1:])]
+        wanted = np.stack([np.broadcast_to(x, CASES) for x in (*columns, *blend.weights)], axis=-1)
+        found = np.zeros(wanted.shape, np.float32)
+        bridge.brdf_numbers(CASES, instances, pointer(runtime.prepare(params, wi)), pointer(found))
+        # Roundings of the largest number on the way, the width of the range.
+        error = np.abs(found - wanted) / (np.abs(wanted) + np.maximum(np.ptp(wanted, axis=0), 1.0))
+        assert error.max() < 1e-6, instruction_set
+
+
+@pytest.mark.parametrize(
+    "name, directional",
+    # Anisotropic adapters always follow the direction.
+    [(name, d) for name in encoding.ENCODERS for d in (True, False) if d or name not in encoding.ANISOTROPIC],
+)
+def test_networks_read_the_same_inputs(tmp_path, name, directional):
+    """A layer that hands its inputs on shows what they are."""
+    rng, space, params = np.random.default_rng(5), CLASS_OF[name], TARGETS["principled"]
+    inputs, size = encoding.size(name, space, directional), output_size(4, params)
+    path = saved(tmp_path, space, name, 4, directional, params, np.eye(size, inputs), np.zeros(size))
+    numbers, wi = drawn(space, rng), views(rng)
+    x, y, z = wi.astype(np.float64).T
+    columns = list(numbers.astype(np.float64).T)
+    wanted = encoding.get(name)(columns, z if directional else None, (x, y))
+    wanted = np.stack([np.broadcast_to(column, CASES) for column in wanted], axis=-1)
+    for instruction_set in in_single_precision():
+        found = Runtime(path, instruction_set).outputs(numbers, wi)
+        error = np.abs(found[:, :inputs] - wanted)
+        # The conductor's Fresnel term cancels for a few metals, at grazing angles most.
+        assert np.quantile(error, 0.999) < 2e-6
+        assert error.max() < 2e-4
+        assert not found[:, inputs:].any()
+
+
+def test_a_single_material_is_known_by_the_same_tolerance(tmp_path):
+    known = LAYERED3.sample(np.random.default_rng(7), 1)[0]
+    known[9] = 0.0
+    adapter = nma.Adapter.load("layered3-3x32")
+    size = output_size(2, adapter.target)
+    layers = [(np.zeros((size, 1), np.float32), np.zeros(size, np.float32))]
+    adapter = nma.Adapter(LAYERED3, "direction", layers, 2, True, adapter.target, {"params": known.tolist()})
+    adapter.save(tmp_path / "single.safetensors")
+    runtime = Runtime(tmp_path / "single.safetensors")
+    for column, scale in ((0, known[0]), (9, 1e-3)):
+        for factor, accepted in ((0.9, True), (1.1, False)):
+            given = known.copy()
+            given[column] += factor * SAME * scale
+            numbers = given.astype(np.float32)
+            known_to_c = runtime._library.nma_check(runtime._handle, pointer(numbers)) == -1
+            assert known_to_c == accepted
+            for call in (lambda x=given: adapter.check(x), lambda x=given: runtime.prepare([x], [0.5])):
+                if accepted:
+                    call()
+                else:
+                    with pytest.raises(nma.errors.ParamError):
+                        call()
+
+
+def test_curves_have_the_same_nodes(bridge):
+    bridge.curve_min_cos.restype = ctypes.c_float
+    assert bridge.curve_nodes() == curves.NODES
+    assert bridge.curve_min_cos() == np.float32(curves.MIN_COS)
+
+
+def test_instruction_sets_have_the_numbers_of_the_c_header():
+    header = (ROOT / "runtime/nma_c.h").read_text()
+    names = re.search(r"enum \{ (.*) \};", header)[1].split(", ")
+    assert tuple(name.removeprefix("NMA_").lower() for name in names[:-1]) == INSTRUCTION_SETS
+    assert names[-1] == f"NMA_COMPACT = {_COMPACT:#x}"
+
+
+def test_cmake_installs_the_version_of_the_package():
+    version = re.search(r"project\(nma VERSION (\S+)", (ROOT / "runtime/CMakeLists.txt").read_text())[1]
+    assert version == nma.__version__
