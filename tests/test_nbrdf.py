@@ -111,8 +111,8 @@ NAMES, WEIGHTS = np.array(["a", "b"]), np.zeros((2, 675), np.float32)
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"weights": WEIGHTS}, "no weights file of NBRDF networks"),
-        ({"names": NAMES}, "no weights file of NBRDF networks"),
+        ({"weights": WEIGHTS}, "not a weights file of NBRDF networks"),
+        ({"names": NAMES}, "not a weights file of NBRDF networks"),
         ({"names": NAMES, "weights": WEIGHTS[:1]}, r"names \(2,\) and weights \(1, 675\)"),
         ({"names": NAMES, "weights": WEIGHTS[:, :-1]}, r"weights \(2, 674\)"),
         ({"names": np.zeros(2), "weights": WEIGHTS}, "are not"),

@@ -1,4 +1,4 @@
-"""What a source of appearance offers to the rest of the package."""
+"""The interfaces of sources: models that walks sample (`Source`) and models that are evaluated (`Values`)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from nma.params import ParamSpace
 
 
 class Random(Protocol):
-    """A stream of random numbers, one per lane, such as Dr.Jit's PCG32."""
+    """A random number generator with one stream per lane, such as Dr.Jit's PCG32."""
 
     def next_float32(self) -> Float:
-        """Uniform in [0, 1)."""
+        """The next number of each stream, uniform in [0, 1)."""
         ...
 
 
@@ -26,48 +26,49 @@ class Random(Protocol):
 class Walk:
     """One random walk per lane, in a form that Dr.Jit's symbolic loops can carry.
 
-    While `alive`, `direction` is where the walk is heading; once it is over and `throughput` is positive, it is wo, the
-    direction in which it left (z > 0). A walk that was absorbed has throughput 0.
+    `direction` is where an `alive` walk is heading. Once a walk has left the material, its `direction` is wo (z > 0).
+    A walk that was absorbed has throughput 0.
     """
 
     direction: tuple[Float, Float, Float]
     throughput: tuple[Float, Float, Float]
     height: Float  # 1 at the top of the slab, 0 at its bottom
-    inside: Mask  # has entered the material
+    inside: Mask  # the walk has entered the material
     alive: Mask
 
     @staticmethod
     def arriving_from(wi: Vec3) -> Walk:
-        """A walk about to meet the surface from `wi` (wi.z > 0), throughput 1."""
+        """A walk with throughput 1 that is about to hit the surface from `wi` (wi.z > 0)."""
         one = wi.x * 0.0 + 1.0
         toward = -wi
         return Walk(tuple(toward), (one, one, one), one, one < 0.5, one > 0.5)
 
 
 class Source(Protocol):
-    """A stochastic appearance model g(wi) -> (wo, throughput), paper eq. 8, one event at a time.
+    """A stochastic appearance model g(wi) -> (wo, throughput), paper eq. 8, simulated event by event.
 
-    The mean of the throughput over all walks that leave through a set of directions is the integral of f cos(theta_o)
-    over that set. A model that only knows its f draws wo from a density p at the first event and returns
-    f cos(theta_o) / p. Throughputs hardly exceed 1: tables count in fixed point.
+    For any set of directions wo, the expected throughput that a walk carries out through the set is the integral of
+    f cos(theta_o) over the set. A model that can only evaluate f draws wo from a density p at the first event and
+    returns f cos(theta_o) / p. Throughputs should hardly exceed 1, because tables count them in fixed point.
     """
 
     space: ParamSpace
 
     def gather(self, columns: list[Any]) -> Any:
-        """The parameters in the form `step` wants, from one array per column of the class's parameter vector."""
+        """Converts the parameters, one array per column of the class's parameter vector, to the form `step` takes."""
         ...
 
     def step(self, params: Any, walk: Walk, rng: Random) -> Walk:
-        """Advances every walk by one event. Lanes whose walk is over may return anything: callers mask them."""
+        """Advances every walk by one event. Lanes whose walk has ended may return anything, as callers mask them."""
         ...
 
 
 class Values(Protocol):
-    """An appearance model that knows its value and nothing else: measurements, tables, networks, a renderer's BSDFs.
+    """An appearance model that can only be evaluated: a measurement, a table, a network or a renderer's BSDF.
 
-    `name` is what texts call it. `isotropic` says whether turning both directions about the normal changes nothing; the
-    mirror image of a pair may still have another value, and a table's folded bins hold the mean of both.
+    `name` stands for the model in messages. `isotropic` says that the value stays the same when both directions turn
+    about the normal. An isotropic model may still give another value for the mirror image of a pair of directions. The
+    folded bins of a table hold the mean of the two values.
     """
 
     @property
@@ -79,16 +80,16 @@ class Values(Protocol):
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
         """f(wi, wo) cos(theta_o) [1/sr] for one pair of unit directions per Dr.Jit lane; 0 below the horizon.
 
-        Linear sRGB without bounds: measured colours out of its gamut have a negative channel.
+        The colour is linear sRGB without bounds: a measured colour outside the gamut has a negative channel.
 
-        Lanes are float32, with or without derivatives, which are not followed. The call may be traced into a kernel, so
-        it neither branches on values nor reads them.
+        Lanes are float32. Their types may carry derivatives, but `eval` does not propagate derivatives. The call may be
+        traced into a kernel, so it must not branch on values or read them.
         """
         ...
 
 
 def direction(mu: NDArray, phi: NDArray) -> Vec3:
-    """Unit directions, one per Dr.Jit lane, from their cosines and azimuths."""
+    """Unit directions, one per Dr.Jit lane, from their cosines `mu` and azimuths `phi` [rad], both (n,)."""
     sin = np.sqrt(1.0 - mu * mu)
     return Vec3(*(dr.auto.Float(x.astype(np.float32)) for x in (sin * np.cos(phi), sin * np.sin(phi), mu)))
 
@@ -99,10 +100,10 @@ def throughput(walk: Walk) -> Color:
 
 
 def walk(source: Source, params: Any, wi: Vec3, rng: Random, active: Mask = True) -> tuple[Vec3, Color]:
-    """One whole walk per lane from `wi` (wi.z > 0): (wo, throughput), wo.z > 0.
+    """Runs one whole walk per lane from `wi` (wi.z > 0) and returns (wo, throughput), with wo.z > 0.
 
-    Walks that were absorbed, and lanes that are not `active`, have throughput 0. The loop is symbolic, so this may run
-    inside a renderer's own loop.
+    The throughput is 0 where the walk was absorbed or the lane is not `active`. The loop is symbolic, so the function
+    can be called inside a renderer's own loop.
     """
     start = Walk.arriving_from(wi)
     start.alive = start.alive & active

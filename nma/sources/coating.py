@@ -1,8 +1,9 @@
 """A rough metal under a clear or tinted coat, in closed form: the analytic coating model of production renderers.
 
-Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces": the coat's own microfacet reflection, plus the
-metal's for the directions refracted at the mean surface, dimmed by both Fresnel transmittances and by absorption along
-both ways. Light that bounces between the layers is left out, so the model is darker than a simulation of the stack.
+The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". It adds two microfacet
+reflections: that of the coat, and that of the metal. The metal's reflection is evaluated for the directions refracted
+at the mean surface. The Fresnel transmittance and the absorption on the way in and on the way out dim it. Light that
+bounces between the two interfaces is left out, so the model is darker than a simulation of the stack.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ from nma.ops import Color, Float, Vec3
 
 @dataclass(frozen=True)
 class Coating:
-    """The model (`Values`): a coat of index `eta` and width `alpha` over the metal `conductor` of width `alpha_metal`.
+    """The coating model (`Values`): a coat of refractive index `eta` (above 1) over the metal `conductor`.
 
-    `absorption` is the coat's optical depth for light at normal incidence, per channel, at least 0. Widths are those of
-    GGX lobes, 1e-4 .. 1; `eta` is above 1. Raises `ParamError` for others, and for a metal that is not in the data.
+    `alpha` and `alpha_metal` are the GGX widths of coat and metal, 1e-4 .. 1. `absorption` is the coat's optical depth
+    at normal incidence, per channel, at least 0. Raises `ParamError` for other numbers, and for a metal that is not
+    among those of `nma.data`.
     """
 
     conductor: str = "Au"
@@ -37,13 +39,13 @@ class Coating:
 
     def __post_init__(self) -> None:
         if self.conductor not in load_conductors().names:
-            raise ParamError(f"coating: there is no conductor '{self.conductor}'; `Cu`, `Au`, `Al` are some")
+            raise ParamError(f"coating: there is no conductor '{self.conductor}'; try `Cu`, `Au` or `Al`")
         for what in ("alpha", "alpha_metal"):
             if not 1e-4 <= getattr(self, what) <= 1:
                 raise ParamError(f"coating: {what} is {getattr(self, what)}, allowed is 0.0001 .. 1")
         if not self.eta > 1 or not all(0 <= a < np.inf for a in self.absorption):
             raise ParamError(
-                f"coating: wants eta > 1 and absorption >= 0, got {self.eta} and {self.absorption}"
+                f"coating: eta must be above 1 and absorption at least 0, got {self.eta} and {self.absorption}"
             )
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
@@ -59,7 +61,8 @@ class Coating:
             inside_i, inside_o, self.alpha_metal
         )
         path = 1.0 / inside_i.z + 1.0 / inside_o.z
-        # Refraction widens the beam inside, by eta^2 cos(inside) / cos(outside): f of the layer times the outer cosine.
+        # Refraction into the coat changes the beam by eta^2 cos(inside) / cos(outside). Divided by this, the metal's
+        # reflection becomes f of the whole stack times the outer cosine.
         through = (1.0 - loss_i) * (1.0 - loss_o) * o.z / (self.eta * self.eta * inside_o.z)
         dimmed = Color(
             *(c * through * ops.exp(-a * path) for c, a in zip(metal, self.absorption, strict=True))
@@ -68,18 +71,18 @@ class Coating:
 
 
 def _facing(wi: Vec3, wo: Vec3) -> Float:
-    """Cosine between either direction and the half vector."""
+    """Cosine of the angle between `wi` and the half vector, the same for `wo`."""
     h = wi + wo
     return 0.5 * ops.sqrt(ops.dot(h, h))
 
 
 def _lobe(wi: Vec3, wo: Vec3, alpha: float) -> Float:
-    """A microfacet reflection without Fresnel, times cos(theta_o). Walter 2007, eq. 20, separable masking."""
+    """A microfacet reflection times cos(theta_o), without its Fresnel term. Walter 2007, eq. 20, separable masking."""
     h = ops.normalize(wi + wo)
     return ggx_d(h, alpha, alpha) * smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha) / (4.0 * wi.z)
 
 
 def _refracted(w: Vec3, eta: float) -> tuple[Vec3, Float]:
-    """The direction beyond the mean surface, turned upwards again, and the share that does not get there."""
+    """The direction refracted at the mean surface, turned upwards again, and the reflected share of the light."""
     loss, cos_t = fresnel_dielectric(w.z, eta)
     return Vec3(w.x / eta, w.y / eta, cos_t), loss

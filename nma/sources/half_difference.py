@@ -1,8 +1,8 @@
-"""Rusinkiewicz coordinates: the half vector, and the light direction as seen from it.
+"""Rusinkiewicz coordinates: the half vector and the difference vector, which is the light in the half vector's frame.
 
 Rusinkiewicz 1998, "A New Change of Variables for Efficient BRDF Representation". The difference vector is built from
-the *light* direction; that of the view direction has the opposite azimuth, phi_d + pi. For isotropic materials the half
-vector is turned to azimuth 0.
+the *light* direction. Built from the view direction, it would have the opposite azimuth, phi_d + pi. All functions here
+are for isotropic materials, so they turn the half vector to azimuth 0.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from nma.ops import Float, Vec3
 
 
 def half_difference(light: Vec3, view: Vec3) -> tuple[Vec3, Vec3]:
-    """(half vector turned to azimuth 0, difference vector), both unit, for unit directions above the surface.
+    """Returns (half vector turned to azimuth 0, difference vector), both of unit length.
 
-    Finite for all others too.
+    `light` and `view` are unit directions above the surface. For any other directions the result is finite.
     """
     h = light + view
     h = h * (1.0 / ops.maximum(ops.sqrt(ops.dot(h, h)), 1e-12))
     sin_h = ops.safe_sqrt(h.x * h.x + h.y * h.y)
-    # Above a vertical half vector every azimuth is as good as another: take 0.
+    # A vertical half vector has no azimuth: take 0.
     tilted = sin_h > 1e-12
     inv = 1.0 / ops.select(tilted, sin_h, 1.0)
     cos_phi, sin_phi = ops.select(tilted, h.x * inv, 1.0), ops.select(tilted, h.y * inv, 0.0)
@@ -30,14 +30,17 @@ def half_difference(light: Vec3, view: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def angles(light: Vec3, view: Vec3) -> tuple[Float, Float, Float]:
-    """(theta_h, theta_d, phi_d): 0 .. pi/2, 0 .. pi/2, -pi .. pi."""
+    """The angles (theta_h, theta_d, phi_d) [rad]. Their ranges are 0 .. pi/2, 0 .. pi/2 and -pi .. pi."""
     h, d = half_difference(light, view)
     sin_d = ops.safe_sqrt(d.x * d.x + d.y * d.y)
     return ops.atan2(h.x, h.z), ops.atan2(sin_d, d.z), ops.atan2(d.y, d.x)
 
 
 def directions(theta_h: Float, theta_d: Float, phi_d: Float) -> tuple[Vec3, Vec3]:
-    """(light, view) of the given angles, with the half vector at azimuth 0. Either may lie below the surface."""
+    """The directions (light, view) that have these angles [rad] and a half vector at azimuth 0.
+
+    Either direction may lie below the surface.
+    """
     sin_h, cos_h = ops.sin(theta_h), ops.cos(theta_h)
     sin_d, z = ops.sin(theta_d), ops.cos(theta_d)
     x, y = sin_d * ops.cos(phi_d), sin_d * ops.sin(phi_d)

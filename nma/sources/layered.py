@@ -1,7 +1,8 @@
 """Position-free random walks through a rough dielectric over a homogeneous medium over a rough conductor.
 
 Guo, Hasan and Zhao 2018, "Position-Free Monte Carlo Simulation for Arbitrary Layered BSDFs". Only depth matters, so a
-walk is a direction, a height in a slab of thickness 1, and a throughput. Dr.Jit alone, no renderer.
+walk consists of a direction, a height in a slab of thickness 1, and a throughput. The code needs Dr.Jit, but no
+renderer.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from nma.ops import Color, Float, Vec3
 from nma.params import LAYERED3
 from nma.sources.base import Random, Walk
 
-# Walks whose brightest channel falls below this go on with a chance in proportion to it; .5 had the least variance
-# times time.
+# Russian roulette begins where the brightest channel of the throughput falls below this threshold. Of the thresholds
+# tried, .5 had the smallest product of variance and time.
 ROULETTE_THRESHOLD = 0.5
-# Chance to go on after total reflection: otherwise a perfect mirror under a smooth coat, without a medium, would hold
-# some walks for ever.
+# Chance of survival after total internal reflection. With a chance of 1, some walks would never end between a smooth
+# coat and a perfect mirror without a medium.
 TRAPPED_SURVIVAL = 0.999
 
 
 @dataclass
 class Layers:
-    """The stack, one value per lane. Indices of the conductor are relative to the coat it lies in."""
+    """The stack, one value per lane. The conductor's indices of refraction are relative to the index of the coat."""
 
     alpha_top: Float
     alpha_bottom: Float
@@ -50,7 +51,7 @@ class Layered3:
     space = LAYERED3
 
     def gather(self, columns: list[Any]) -> Layers:
-        """Layers from the 13 columns of the class's parameter vector."""
+        """The stack from the 13 columns of the class's parameter vector."""
         alpha_top, alpha_bottom, eta_top, *rest = columns
         eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
         # The conductor's Fresnel term sees the index of the coat, not that of air.
@@ -73,18 +74,19 @@ class Layered3:
         upward = walk.inside & (d.z > 0)
         at_bottom = walk.inside & (d.z <= 0)
 
-        # Fly to the next event: somewhere in the medium, or the interface ahead.
+        # Fly to the next event, which is in the medium or at the interface ahead.
         optical_depth = -dr.log(1.0 - u_flight)
         height = walk.height + d.z * (optical_depth / dr.maximum(params.sigma_t, 1e-20))
         in_medium = walk.inside & (params.sigma_t > 0) & (height > 0) & (height < 1)
 
-        # At an interface, look at it from the side the walk is on, with the normal toward that side.
+        # At an interface, work in a frame whose normal points to the side the walk comes from.
         alpha = dr.select(at_bottom, params.alpha_bottom, params.alpha_top)
         w = Vec3(-d.x, -d.y, dr.maximum(dr.abs(d.z), 1e-7))
         m = sample_visible_normal(w, alpha, alpha, u1, u2)
         cos_m = dr.maximum(ops.dot(w, m), 0.0)
 
-        # The coat reflects by chance in proportion to its Fresnel term, the conductor always and with its colour.
+        # The coat reflects with a probability equal to its Fresnel term. The conductor always reflects, and the
+        # throughput is multiplied by its colour.
         eta = dr.select(upward, 1.0 / params.eta_top, params.eta_top)
         fresnel, cos_t = fresnel_dielectric(cos_m, eta)
         reflects = at_bottom | (u_lobe < fresnel)
@@ -95,7 +97,7 @@ class Layered3:
         tint = fresnel_conductor_rgb(cos_m, Color(*params.eta_bottom), Color(*params.k_bottom))
         weight = ops.select(at_bottom, tint, Color.of(1.0)) * smith_g1(out, alpha, alpha)
         weight = ops.select(valid, weight, Color.of(0.0))
-        # Back to the slab's frame: the side below the coat sees its normal pointing down.
+        # Go back to the slab's frame: for a walk below the coat, the normal pointed down.
         out = Vec3(out.x, out.y, dr.select(upward, -out.z, out.z))
 
         # In the medium, scatter isotropically.
@@ -118,7 +120,10 @@ def _uniform_sphere(u1: Float, u2: Float) -> Vec3:
 
 
 def _roulette(value: Color, exempt: Any, trapped: Any, rng: Random) -> tuple[Any, Color]:
-    """Russian roulette on the brightest channel: (survives, value over the chance of survival)."""
+    """Russian roulette on the brightest channel. Returns (survives, `value` divided by the chance of survival).
+
+    Walks that are `exempt` always survive. Walks that are `trapped` survive with `TRAPPED_SURVIVAL` at most.
+    """
     most = dr.select(trapped, TRAPPED_SURVIVAL, 1.0)
     chance = dr.select(exempt, 1.0, dr.minimum(ops.max_component(value) * (1.0 / ROULETTE_THRESHOLD), most))
     survives = rng.next_float32() < chance

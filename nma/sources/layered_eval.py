@@ -1,9 +1,15 @@
-"""f cos(theta_o) of the layered source at a given pair of directions: an unbiased estimate, and a density close to it.
+"""The layered source at a given pair of directions: an unbiased estimate of f cos(theta_o), and a similar density.
 
-Walks count what leaves through a set of directions; a renderer also asks for one direction. Light from wi to wo either
-mirrors off the coat, which has a closed form, or crosses it, and then either never meets the medium or scatters in it a
-last time. Each kind is sampled so that no pair of narrow lobes has to meet by chance (compare Guo, Hasan and Zhao 2018,
-section 5). Densities are the walk's, a particle's, without the squared index that radiance gains on entering.
+Random walks measure the light that leaves through a set of directions. A renderer also asks for the value at a single
+pair (wi, wo). The light from wi to wo splits into three kinds:
+
+- Light that the coat's upper side reflects. It has a closed form.
+- Light that enters the coat and meets interfaces only.
+- Light that enters the coat and scatters in the medium at least once.
+
+The last two kinds are sampled so that two narrow lobes never have to meet by chance (compare Guo, Hasan and Zhao 2018,
+section 5). All densities are those of particles, as in the walk. They lack the factor of the squared index by which
+radiance grows when it enters the coat.
 """
 
 from __future__ import annotations
@@ -26,36 +32,38 @@ from nma.ops import Color, Float, Mask, Vec3
 from nma.sources.base import Random, Walk, throughput
 from nma.sources.layered import Layered3, Layers
 
-# A coat whose index is closer to 1 than this bends light by less than single precision resolves: it is taken as none.
+# A coat whose index is closer to 1 than this bends light too little for single precision, so `settle` sets it to 1.
 INDEX_MATCHED = 1e-3
 _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
-# Share of the cosine lobe beside the others before normalisation, for light that the other lobes do not expect.
+# The least weight of the cosine lobe before normalisation, for light that the other lobes do not cover.
 LEAST_DIFFUSE = 0.03
 
 
 def settle(layers: Layers) -> Layers:
-    """The layers as `evaluate` and `pdf` want them: a coat that is almost index-matched becomes exactly so."""
+    """The stack in the form that `evaluate` and `pdf` need: an almost index-matched coat gets the index 1 exactly."""
     return replace(layers, eta_top=dr.select(layers.eta_top < 1.0 + INDEX_MATCHED, 1.0, layers.eta_top))
 
 
 def evaluate(layers: Layers, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True) -> Color:
     """One unbiased estimate per lane of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
 
-    `layers` come from `settle`. The mean over a set of wo is what `nma.sources.base.walk` counts there.
+    `layers` must come from `settle`. The expected integral over a set of wo equals the expected throughput that
+    `nma.sources.base.walk` carries through the set.
     """
     there, back = _enter(layers, wi, rng), _enter(layers, wo, rng)
     there.alive = back.alive = there.alive & back.alive & active
     forward, _ = _unscattered(layers, wi, there, wo, back, rng, True)
     backward, detour = _unscattered(layers, wo, back, wi, there, rng, False)
     scattered = _scattered(layers, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
-    # Reciprocity: f cos(theta_i) is known from walks that start at wo, their radiance from below the coat.
+    # Walks from wo estimate f cos(theta_i), so reciprocity turns their result into f cos(theta_o). The way out is given
+    # below the coat, where radiance is larger by the squared index.
     index2 = layers.eta_top * layers.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(layers, wi, wo)
 
 
 def coat_reflection(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
-    """f cos(theta_o) of the coat's upper side alone [1/sr]. Walter 2007, eq. 20."""
+    """f cos(theta_o) [1/sr] of the reflection at the coat's upper side alone. Walter 2007, eq. 20."""
     m = ops.normalize(wi + wo)
     fresnel, _ = fresnel_dielectric(ops.maximum(ops.dot(wi, m), 0.0), layers.eta_top)
     alpha = layers.alpha_top
@@ -64,7 +72,10 @@ def coat_reflection(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
 
 
 def _enter(layers: Layers, w: Vec3, rng: Random) -> Walk:
-    """A walk from `w` just below the coat. All of it goes down: what the coat reflects is known in closed form."""
+    """A walk that has come from `w` and is now just below the coat.
+
+    It always refracts, since the light that the coat reflects has a closed form.
+    """
     alpha = layers.alpha_top
     view = _above(w)
     m = sample_visible_normal(view, alpha, alpha, rng.next_float32(), rng.next_float32())
@@ -76,19 +87,19 @@ def _enter(layers: Layers, w: Vec3, rng: Random) -> Walk:
 
 
 def _crossing(layers: Layers, walk: Walk) -> Walk:
-    """The walk with its throughput dimmed by crossing the whole slab."""
+    """The walk after crossing the whole slab, its throughput multiplied by the slab's transmittance."""
     dimmed = throughput(walk) * _transmittance(layers, 1.0, Vec3(*walk.direction))
     return replace(walk, throughput=tuple(dimmed))
 
 
 def _transmittance(layers: Layers, depth: Float, w: Vec3) -> Float:
-    """Fraction that passes `depth` of the slab (all of it: 1) along `w` without meeting the medium."""
+    """Fraction of light along `w` that passes `depth` of the slab (1: the whole slab) without meeting the medium."""
     return ops.exp(-layers.sigma_t * depth / ops.maximum(ops.absolute(w.z), 1e-7))
 
 
 @dataclass
 class _Detour:
-    """One segment of a walk beyond its first, kept by weighted reservoir sampling (Chao 1982)."""
+    """One segment of a walk after its first segment, chosen by weighted reservoir sampling (Chao 1982)."""
 
     direction: tuple[Float, Float, Float]
     tint: tuple[Float, Float, Float]
@@ -106,20 +117,21 @@ class _Detour:
         )
 
     def chosen(self) -> tuple[Vec3, Color]:
-        """Its direction, and its throughput over the chance that it was kept."""
+        """The segment's direction, and its throughput divided by the chance of its choice."""
         return Vec3(*self.direction), Color(*self.tint) * self.total
 
 
 def _unscattered(
     layers: Layers, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
 ) -> tuple[Color, tuple[Vec3, Color]]:
-    """Light from wi to wo that meets interfaces only, and a segment of the walk `there` after its first.
+    """Light from wi to wo that meets interfaces only, and one segment of the walk `there` after its first segment.
 
-    A path enters through the coat, visits the conductor once or more, and leaves through the coat. All its events but
-    one can be drawn, from either end; the other has to meet by chance, and is best the one whose lobe is the widest
-    there. This walk leaves to chance the way out (it goes on, and asks for wo), or the last visit (the way out is drawn
-    from wo, as `back`). Walking from wo does so for the way in and the first visit; a path of one visit has three such
-    choices. They are joined by a balance heuristic (Veach 1997, eq. 9.8) on the sharpness of those events.
+    A path enters through the coat, visits the conductor once or more, and leaves through the coat. It is sampled from
+    both ends. All events are drawn except one, the connection, where the two ends meet by chance. The best connection
+    is the event with the widest lobe. The walk from wi connects at the way out (the walk goes on, and its density of
+    leaving along wo is evaluated) or at the last visit (the way out is drawn from wo, as `back`). The walk from wo
+    connects at the way in or at the first visit. A path with one visit thus has three possible connections. The balance
+    heuristic (Veach 1997, eq. 9.8) combines the connections by the sharpness of their events.
     """
     source, clear = Layered3(), replace(layers, sigma_t=layers.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
@@ -128,10 +140,13 @@ def _unscattered(
     matched = layers.eta_top == 1.0
 
     def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
-        """What a visit to the conductor sends to wo, and the first visit's bluntness (`first` is 0 before it)."""
+        """Light that a visit to the conductor sends to wo, and the bluntness of the walk's first visit.
+
+        `first` is 0 before the first visit, then its bluntness.
+        """
         w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
         rest = way_in + first
-        # The last visit left to chance; an index-matched coat has no other way out, and no second visit.
+        # Connect at the last visit. This is the only connection under an index-matched coat, which turns no light back.
         q, t = drawn_out
         blunt = _bluntness(_sharpness(layers, w_in, drawn_up))
         share = ops.select(matched, 1.0, blunt / (blunt + rest + _bluntness(q)))
@@ -143,7 +158,7 @@ def _unscattered(
             * _transmittance(layers, 1.0, drawn_up)
         )
         found = throughput(before) * _conductor_weight(layers, w_in, drawn_up) * (share * meets)
-        # The way out left to chance.
+        # Connect at the way out.
         q, t = _out_through_coat(layers, wo, went_up)
         blunt = _bluntness(_sharpness(layers, w_in, went_up))
         share = ops.select(matched, 0.0, _bluntness(q) / (_bluntness(q) + blunt + rest))
@@ -165,10 +180,10 @@ def _unscattered(
 
 
 def _scattered(layers: Layers, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
-    """Light that scatters in the medium: at each scattering, as if it were the last, it takes the `ways` out.
+    """Light that scatters in the medium. Every scattering vertex of the walk is connected to each of the `ways` out.
 
-    A way out is a segment of a walk from wo that met interfaces only, and its throughput. However narrow the lobes on
-    it, light finds it, as the medium scatters into all directions.
+    A way out is the direction and the throughput of a segment of a walk from wo that met interfaces only. The medium
+    scatters into all directions, so a connection succeeds however narrow the lobes along the way out are.
     """
     source = Layered3()
 
@@ -176,7 +191,7 @@ def _scattered(layers: Layers, there: Walk, ways: list[tuple[Vec3, Color]], rng:
         after = source.step(layers, walk, rng)
         out = Color.of(0.0)
         for d, reached in ways:
-            # Light takes the way backwards: from the vertex to the interface where the segment began.
+            # The light travels against the segment, from the vertex to the interface where the segment began.
             depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
             out = out + reached * (_transmittance(layers, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
         found = throughput(walk) * Color(*layers.albedo) * out * _ISOTROPIC_PHASE
@@ -195,12 +210,12 @@ def _bluntness(density: Float) -> Float:
 
 
 def _sharpness(layers: Layers, w_in: Vec3, up: Vec3) -> Float:
-    """Density about a visit to the conductor [1/sr], the same for both directions in which it can be walked."""
+    """Approximate density [1/sr] of the conductor's reflection from `w_in` to `up`. It is the same in reverse."""
     return 0.25 * ggx_d(ops.normalize(w_in + up), layers.alpha_bottom, layers.alpha_bottom)
 
 
 def _conductor_weight(layers: Layers, w_in: Vec3, up: Vec3) -> Color:
-    """What the walk is multiplied by where the conductor mirrors `w_in` into `up`."""
+    """Factor of a walk's throughput where the conductor reflects it from `w_in` into `up`."""
     view = _above(w_in)
     cos_m = ops.dot(view, ops.normalize(view + up))
     tint = fresnel_conductor_rgb(cos_m, Color(*layers.eta_bottom), Color(*layers.k_bottom))
@@ -208,9 +223,11 @@ def _conductor_weight(layers: Layers, w_in: Vec3, up: Vec3) -> Color:
 
 
 def _out_through_coat(layers: Layers, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
-    """(q, t): density of `up` when wo is refracted down by visible normals [1/sr], and density of wo given `up` over q.
+    """Two densities of refraction at the coat, returned as (q, t).
 
-    Walter 2007, eq. 16 (half vector) and 17 (its Jacobian); in t the distribution and the Jacobian cancel.
+    q [1/sr] is the density of `up` when wo is refracted down at a visible normal. t is the density of wo given `up`,
+    divided by q; the microfacet distribution and the Jacobian cancel in t. Walter 2007, eq. 16 (half vector) and 17
+    (Jacobian).
     """
     alpha, eta = layers.alpha_top, layers.eta_top
     matched = eta == 1.0
@@ -227,27 +244,30 @@ def _out_through_coat(layers: Layers, wo: Vec3, up: Vec3) -> tuple[Float, Float]
 
 
 def _mirror_pdf(w: Vec3, out: Vec3, alpha: Float) -> Float:
-    """Density of `out` when `w` is mirrored in a visible normal [1/sr]. Walter 2007, eq. 14."""
+    """Density [1/sr] of `out` when `w` is reflected at a visible normal. Walter 2007, eq. 14."""
     m = ops.normalize(w + out)
     return visible_normal_pdf(w, m, alpha, alpha) / (4.0 * ops.maximum(ops.dot(w, m), 1e-7))
 
 
 def _above(w: Vec3) -> Vec3:
-    """`w` kept off the horizon, where visible normals are undefined."""
+    """`w` moved slightly above the horizon, where visible normals are undefined."""
     return Vec3(w.x, w.y, ops.maximum(w.z, 1e-7))
 
 
 def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
-    """Weights of the lobes of `pdf` (coat, conductor seen through it, cosine; sum 1), and the width of the second.
+    """Weights of the three lobes of `pdf`, which sum to 1, and the width of the second lobe.
 
-    Tilts add in variance: a facet of the conductor shifts the tangential part of a direction by 2 cos_t times its
-    slope, one of the coat, which is crossed twice, by (eta cos_t - cos_i) / eta times its own.
+    The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The
+    variances of tilted facets add up to the width of the second. A facet of the conductor shifts the tangential part of
+    a direction by 2 cos_t times the facet's slope. A facet of the coat shifts it by (eta cos_t - cos_i) / eta times the
+    facet's slope, and light crosses the coat twice.
     """
     eta, cos_i = layers.eta_top, ops.maximum(wi.z, 1e-3)
     fresnel, cos_t = fresnel_dielectric(cos_i, eta)
     crossing = layers.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
     width2 = layers.alpha_bottom * layers.alpha_bottom + 2.0 * crossing * crossing
-    # Of the conductor's lobe, the coat turns back what lies beyond its critical angle; it comes out anywhere.
+    # The coat reflects the part of the conductor's lobe beyond the critical angle back down. That light may later leave
+    # in any direction.
     critical = 1.0 / (eta + ops.safe_sqrt(eta * eta - 1.0))
     trapped = width2 / (width2 + critical * critical)
     metal = _mean(fresnel_conductor_rgb(cos_t, Color(*layers.eta_bottom), Color(*layers.k_bottom)))
@@ -261,7 +281,10 @@ def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
 
 
 def pdf(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
-    """A density of wo [1/sr] near the walk's, integral at most 1, positive for wo.z > 0: for weighing estimators."""
+    """A density of wo [1/sr] similar to that of the walk, for importance sampling and for weighing estimators.
+
+    It is positive for wo.z > 0, and its integral is at most 1.
+    """
     (coat, bottom, diffuse), width = lobes(layers, wi)
     inside_i, inside_o = refract_flat(wi, layers.eta_top), refract_flat(wo, layers.eta_top)
     jacobian = wo.z / (layers.eta_top * layers.eta_top * inside_o.z)
@@ -271,13 +294,16 @@ def pdf(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
 
 
 def sample(layers: Layers, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
-    """A direction of density `pdf`, for three numbers uniform in [0, 1); one that does not point up is none at all."""
+    """Draws a direction with density `pdf` from three numbers uniform in [0, 1).
+
+    A direction that does not point up is an invalid sample.
+    """
     (coat, bottom, _), width = lobes(layers, wi)
     on_coat, eta = u_lobe < coat, layers.eta_top
     view = ops.select(on_coat, _above(wi), refract_flat(wi, eta))
     alpha = ops.select(on_coat, layers.alpha_top, width)
     mirrored = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
-    # Light from below leaves through a flat coat, which keeps in what meets it too obliquely.
+    # Light from the conductor leaves through a flat coat. Total internal reflection keeps oblique light inside.
     cos2 = 1.0 - eta * eta * (1.0 - mirrored.z * mirrored.z)
     leaves = (mirrored.z > 0) & (cos2 > 0)
     seen = Vec3(mirrored.x * eta, mirrored.y * eta, ops.select(leaves, ops.safe_sqrt(cos2), -1.0))
@@ -288,7 +314,7 @@ def sample(layers: Layers, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec
 
 
 def refract_flat(w: Vec3, eta: Float) -> Vec3:
-    """Where light along `w` comes from under a flat coat of index `eta`, pointing up still (Snell's law)."""
+    """The direction `w` refracted into a flat coat of index `eta` (Snell's law), turned to point up."""
     x, y = w.x / eta, w.y / eta
     return Vec3(x, y, ops.sqrt(ops.maximum(1.0 - x * x - y * y, 1e-7)))
 

@@ -1,10 +1,12 @@
-"""The `.binary` files of the MERL BRDF database, read, looked up, and written from any other source.
+"""The `.binary` files of the MERL BRDF database: reading, evaluation, and writing from any isotropic source.
 
-Matusik et al. 2003, "A Data-Driven Reflectance Model". Three little-endian int32 (90, 90, 180), then three planes of
-float64 for red, green and blue, phi_d fastest, then theta_d, then theta_h. theta_h is spaced by its square root, the
-other angles uniformly. Each channel has its own scale; what is negative was not measured.
+Matusik et al. 2003, "A Data-Driven Reflectance Model". A file has three little-endian int32 (90, 90, 180), then three
+planes of float64 for red, green and blue. Within a plane phi_d varies fastest, then theta_d, then theta_h. The grid is
+uniform in the square root of theta_h and in the two other angles. Each channel has its own scale. A negative number
+means that the entry was not measured.
 
-Azimuths phi_d and phi_d + pi share an entry: the format takes reciprocity for granted, swapping view and light.
+The azimuths phi_d and phi_d + pi share an entry. Swapping view and light exchanges these azimuths, so the format
+assumes that materials are reciprocal.
 """
 
 from __future__ import annotations
@@ -26,12 +28,13 @@ from nma.sources.half_difference import angles, directions
 from nma.sources.lookup import Lookup
 
 SHAPE = (90, 90, 180)
-# f in 1/sr is the number in the file times these, for red, green and blue.
+# f [1/sr] is the number in the file times these scales, for red, green and blue.
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
-# Size of every file in bytes.
+# The size of every file in bytes.
 BYTES = 12 + 3 * 8 * math.prod(SHAPE)
 
-# Entries that see either direction under a smaller cosine get no value: f cos / cos would lose its digits.
+# `Merl.of` gives no value to entries where the cosine of either direction is smaller: dividing f cos(theta_o) by
+# cos(theta_o) would lose too many digits there.
 _MIN_COS = 1e-4
 _NO_DATA = -1.0
 
@@ -39,11 +42,11 @@ _NO_DATA = -1.0
 class Merl:
     """A measured isotropic BRDF (`Values`).
 
-    `planes` (3, 90, 90, 180) float64 are the numbers as the file has them: channel, theta_h, theta_d, phi_d.
+    `planes` (3, 90, 90, 180) float64 are the numbers of the file. The axes are channel, theta_h, theta_d and phi_d.
 
-    The database's own reader truncates angles to an entry's number, so that an entry stands for a cell. We take it
-    for the value in the middle of its cell, and interpolate linearly between those of the neighbours that were
-    measured.
+    The database's own reader rounds angles down to the index of an entry, so an entry stands for a whole cell. Here an
+    entry is the value in the middle of its cell. Between the middles, `eval` interpolates linearly, using only the
+    neighbours that were measured.
     """
 
     isotropic = True
@@ -53,12 +56,12 @@ class Merl:
             raise SourceError(f"{name}: MERL planes have shape {(3, *SHAPE)}, got {planes.shape}")
         self.planes, self.name = planes, name
         measured = (planes >= 0).all(axis=0)
-        # The fourth channel counts what was measured.
+        # The fourth channel is 1 where an entry was measured, else 0.
         cells = np.concatenate([planes * SCALE[:, None, None, None], np.ones((1, *SHAPE))]) * measured
         self._lookup = Lookup(np.moveaxis(cells, 0, -1), (False, False, True))
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
-        """f cos(theta_o) [1/sr]; 0 where nothing around was measured."""
+        """f cos(theta_o) [1/sr], or 0 where none of the neighbouring entries was measured."""
         theta_h, theta_d, phi_d = angles(wo, wi)
         position = (
             SHAPE[0] * dr.sqrt(theta_h * (2.0 / math.pi)),
@@ -71,7 +74,7 @@ class Merl:
 
     @staticmethod
     def load(path: str | Path) -> Merl:
-        """Reads a file; `SourceError` says what is wrong with it."""
+        """Reads a file. Raises `SourceError` with the fault if the file is missing or damaged."""
         return Merl(read(path), Path(path).stem)
 
     def save(self, path: str | Path) -> None:
@@ -80,10 +83,10 @@ class Merl:
 
     @staticmethod
     def of(values: Values) -> Merl:
-        """Any isotropic source in MERL's resolution, each entry the value at the middle of its cell.
+        """Samples any isotropic source at MERL's resolution: each entry is the value at the middle of its cell.
 
-        An entry is the mean of f over both orders of view and light, since the file cannot tell them apart: what is not
-        reciprocal becomes so. Raises `SourceError` for anisotropic sources.
+        The file cannot tell view and light apart, so an entry is the mean of f over both orders of the two directions.
+        This makes a source reciprocal even if it was not. Raises `SourceError` for anisotropic sources.
         """
         if not values.isotropic:
             raise SourceError(f"{values.name}: MERL files hold isotropic materials, this one is anisotropic")
@@ -93,14 +96,14 @@ class Merl:
         light, view = directions(h * h * (0.5 * math.pi), d * (0.5 * math.pi), p * math.pi)
         seen = (light.z > _MIN_COS) & (view.z > _MIN_COS)
         dr.eval(*light, *view)
-        # One after the other: the same kernel, compiled once, with half the work.
+        # Evaluate one order after the other: the second call uses the kernel that the first has compiled.
         f = 0.5 * (_brdf(values, view, light) + _brdf(values, light, view))
         planes = f.reshape(3, *SHAPE) / SCALE[:, None, None, None]
         return Merl(np.where(seen.numpy().reshape(SHAPE), planes, _NO_DATA), values.name)
 
 
 def read(path: str | Path) -> NDArray[np.float64]:
-    """The planes (3, 90, 90, 180) of a file as it has them; `SourceError` says what is wrong with it."""
+    """The planes (3, 90, 90, 180) of a file, unscaled. Raises `SourceError` with the fault if the file is damaged."""
     path = Path(path)
     content = files.content(path, "MERL")
     _check_size(path, content)
@@ -115,19 +118,19 @@ def read(path: str | Path) -> NDArray[np.float64]:
 
 
 def _brdf(values: Values, wi: Vec3, wo: Vec3) -> NDArray[np.float32]:
-    """f (3, n) [1/sr], at least 0, since negative numbers mean something else in the file."""
+    """f (3, n) [1/sr], at least 0, since a negative number in a file means "not measured"."""
     f = Color(*(ops.maximum(c, 0.0) for c in values.eval(wi, wo))) * (1.0 / ops.maximum(wo.z, _MIN_COS))
     dr.eval(*f)
     return np.stack([c.numpy() for c in f])
 
 
 def _check_size(path: Path, content: bytes) -> None:
-    """Refuses what is too short, too long, or of other dimensions."""
+    """Raises `SourceError` if the file is too short or too long, or has other dimensions."""
     if len(content) < 12:
         raise SourceError(f"{path}: {len(content)} bytes are no MERL file; copy it again")
     shape = tuple(np.frombuffer(content, "<i4", 3).tolist())
     if shape != SHAPE:
-        raise SourceError(f"{path}: its dimensions are {shape}, those of a MERL file {SHAPE}")
+        raise SourceError(f"{path}: its dimensions are {shape}, a MERL file has {SHAPE}")
     if len(content) != BYTES:
         what = "truncated" if len(content) < BYTES else "too long"
         raise SourceError(f"{path}: {what}, {len(content):,} bytes instead of {BYTES:,}; copy it again")

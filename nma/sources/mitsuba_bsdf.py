@@ -1,7 +1,8 @@
-"""Any BSDF of Mitsuba 3 as a source: from a dictionary, from XML, or a measured one from RGL's database.
+"""Any BSDF of Mitsuba 3 as a source: from a dictionary, from XML, or from a measured material of RGL's database.
 
-Only light that the front reflects counts: what is transmitted, and what the back of a two-sided BSDF reflects, is left
-out. A perfectly specular lobe has no value at a pair of directions, so BSDFs that reflect like that are refused.
+Only the light that the front side reflects counts. Transmitted light is left out, and so is the light that the back of
+a two-sided BSDF reflects. A perfectly specular reflection has no value at a pair of directions, so a BSDF with one is
+refused.
 """
 
 from __future__ import annotations
@@ -20,20 +21,21 @@ from nma.ops import Color, Vec3
 from nma.sources import rgl
 from nma.sources.base import direction
 
-# Pairs of directions that tell whether a BSDF is isotropic, and the relative change that rounding explains.
+# A BSDF is tested for isotropy at this many pairs of directions. Rounding explains relative changes up to `_ROUNDING`.
 _PAIRS = 512
 _ROUNDING = 1e-3
-# Directions closer to the horizon are taken for ones of this cosine. If both lie there, on opposite sides, nothing is
-# left of their half vector in single precision, and Mitsuba's measured and rough BSDFs are NaN.
+# Directions closer to the horizon are lifted to this cosine. If both lie at the horizon, on opposite sides, single
+# precision loses their half vector, and Mitsuba's measured and rough BSDFs return NaN.
 _MIN_COS = 1e-6
 
 
 class MitsubaBsdf:
-    """A BSDF (`Values`) of the variant that was chosen when it was made; without one, the GPU's or LLVM's is chosen.
+    """A Mitsuba BSDF (`Values`), tied to the Mitsuba variant in which it was made.
 
-    `bsdf`: an instance of `mi.BSDF`. `uv`: where its textures are looked up. `isotropic` is found out by turning pairs
-    of directions, unless it is given. Raises `SourceError` for BSDFs with a perfectly specular reflection, and
-    `ParamError` in a variant that is not vectorised or not RGB.
+    If no variant is set yet, it sets `cuda_ad_rgb` on a machine with a GPU, else `llvm_ad_rgb`. `bsdf` is an instance
+    of `mi.BSDF`. `uv` is the point where its textures are looked up. `isotropic` says whether the BSDF is isotropic; if
+    it is None, a test with turned pairs of directions decides. Raises `SourceError` for a BSDF with a perfectly
+    specular reflection, and `ParamError` if the variant is not vectorised or not RGB.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class MitsubaBsdf:
         return Color(*(type(wi.z)(c) for c in plain))
 
     def _is_isotropic(self) -> bool:
-        """Whether values stay when both directions are turned about the normal."""
+        """Whether values stay the same when both directions turn about the normal."""
         rng = np.random.default_rng(0)
         mu_i, mu_o = rng.uniform(0.05, 0.95, (2, _PAIRS))
         phi_i, phi_o, turn = rng.uniform(0.0, 2.0 * np.pi, (3, _PAIRS))
@@ -81,9 +83,9 @@ class MitsubaBsdf:
 
 
 def from_dict(description: Mapping[str, Any], name: str | None = None, **options: Any) -> MitsubaBsdf:
-    """The BSDF of a dictionary that `mi.load_dict` understands; `options` as `MitsubaBsdf` takes them.
+    """The BSDF of a dictionary for `mi.load_dict`. The `options` are those of `MitsubaBsdf`.
 
-    Raises `SourceError` for what Mitsuba cannot load, and for a file of a measured material that is damaged.
+    Raises `SourceError` if Mitsuba cannot load the dictionary, or if it names a damaged file of a measured material.
     """
     for filename in _measured_files(description):
         rgl.read(filename)
@@ -92,29 +94,32 @@ def from_dict(description: Mapping[str, Any], name: str | None = None, **options
 
 
 def from_xml(path: str | Path, **options: Any) -> MitsubaBsdf:
-    """The BSDF of an XML file whose outermost element is <bsdf>; `options` as `MitsubaBsdf` takes them."""
+    """The BSDF of an XML file whose outermost element is <bsdf>. The `options` are those of `MitsubaBsdf`.
+
+    Raises `SourceError` as `from_dict` does.
+    """
     path = Path(path)
     if not os.path.isfile(path):
         raise SourceError(f"{path}: no such file")
     for filename in _measured_in_xml(path.read_bytes()):
-        # Names are relative to the file that has them.
+        # File names in the XML are relative to the folder of the XML file.
         rgl.read(path.parent / filename)
     return _made(lambda mi: mi.load_file(str(path)), str(path), options)
 
 
 def from_string(text: str, **options: Any) -> MitsubaBsdf:
-    """The BSDF of a fragment of XML, '<bsdf version="3.0.0" type="...">...'; `options` as `MitsubaBsdf` takes them."""
+    """The BSDF of an XML string, '<bsdf version="3.0.0" type="...">...'. The `options` are those of `MitsubaBsdf`."""
     for filename in _measured_in_xml(text.encode()):
         rgl.read(filename)
     return _made(lambda mi: mi.load_string(text), "XML", options)
 
 
 def measured(path: str | Path, **options: Any) -> MitsubaBsdf:
-    """A material of RGL's database, isotropic or anisotropic, in RGB.
+    """A material of RGL's database, isotropic or anisotropic, in RGB. The `options` are those of `MitsubaBsdf`.
 
-    Raises `SourceError` for a file that is missing, damaged or spectral.
+    Raises `SourceError` if the file is missing, damaged or spectral.
     """
-    # Mitsuba takes a file with up to two azimuths of incidence for isotropic.
+    # For Mitsuba, a file with at most two azimuths of incidence is isotropic.
     isotropic = len(rgl.read(path)["phi_i"]) <= 2
     description = {"type": "measured", "filename": str(path)}
     options = {"isotropic": isotropic} | options
@@ -122,7 +127,7 @@ def measured(path: str | Path, **options: Any) -> MitsubaBsdf:
 
 
 def _measured_files(description: Mapping[str, Any]) -> Iterator[str]:
-    """The files of the measured materials in a dictionary, however deep."""
+    """The file names of all measured materials in a dictionary, nested ones included."""
     if description.get("type") == "measured":
         yield str(description.get("filename"))
     for value in description.values():
@@ -131,7 +136,10 @@ def _measured_files(description: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _measured_in_xml(text: bytes) -> list[str]:
-    """The files of the measured materials in XML; none where it does not parse, which Mitsuba then says."""
+    """The file names of all measured materials in an XML text.
+
+    A text that does not parse gives an empty list, since Mitsuba reports the fault when it loads the text.
+    """
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -143,7 +151,7 @@ def _measured_in_xml(text: bytes) -> list[str]:
 
 
 def choose_variant() -> Any:
-    """Mitsuba in a vectorised RGB variant: the one in use, or where there is none that of Dr.Jit's backend."""
+    """The module `mitsuba` in a vectorised RGB variant. If no variant is set, sets the one for Dr.Jit's backend."""
     import mitsuba
 
     mi: Any = mitsuba  # its types change with the variant
@@ -158,7 +166,7 @@ def choose_variant() -> Any:
 
 
 def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> MitsubaBsdf:
-    """What `load(mi)` makes, if it is a BSDF; Mitsuba's errors as `SourceError`."""
+    """The BSDF that `load(mi)` returns, as a source. Raises `SourceError` if Mitsuba fails or returns another object."""
     mi = choose_variant()
     try:
         bsdf = load(mi)
@@ -171,7 +179,7 @@ def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> 
 
 
 def _interaction(mi: Any, wi: Any, uv: tuple[float, float]) -> Any:
-    """A point of a flat surface seen from `wi`, with a frame for those BSDFs that bend it."""
+    """A point on a flat surface, seen from `wi`. It has a shading frame, which bump and normal maps need."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
     si.wi = wi
     si.uv = mi.Point2f(*uv)

@@ -1,10 +1,11 @@
-"""Neural BRDFs: one small network per material that maps a pair of directions to its BRDF.
+"""Neural BRDFs: one small network per material that maps a pair of directions to the BRDF's value.
 
-Sztrajman et al. 2021, "Neural BRDF Representation and Importance Sampling". Networks fitted to MERL's materials are
-reconstructions, not measurements: texts call them NBRDF-MERL, those fitted to RGL's NBRDF-RGL.
+Sztrajman et al. 2021, "Neural BRDF Representation and Importance Sampling". The networks are reconstructions, not
+measurements. We call those fitted to MERL's materials NBRDF-MERL, and those fitted to RGL's materials NBRDF-RGL.
 
-A weights file (`.npz`) has `names` (n,) and `weights` (n, 675): matrices and biases of 6 -> 21 -> 21 -> 3 with ReLU, in
-the order k1 (6, 21), b1, k2 (21, 21), b2, k3 (21, 3), b3, applied as x @ k + b.
+A weights file (`.npz`) has `names` (n,) and `weights` (n, 675). A row of weights has the matrices and biases of the
+network 6 -> 21 -> 21 -> 3 with ReLU, in the order k1 (6, 21), b1, k2 (21, 21), b2, k3 (21, 3), b3. A layer computes
+x @ k + b.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from nma.sources.half_difference import half_difference
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# A material by which the data set that the networks were fitted to is known.
+# One material of each data set: a weights file that has it was fitted to that data set.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
 class Nbrdf:
-    """One material's network (`Values`). It is neither reciprocal nor symmetric but by how well it was trained."""
+    """One material's network (`Values`). It is reciprocal and symmetric only as far as it has learned to be."""
 
     isotropic = True
 
     def __init__(self, weights: NDArray, name: str = "NBRDF"):
-        """`weights` (675,) in the order of the file. Raises `SourceError` for others."""
+        """`weights` (675,) are in the order of the file. Raises `SourceError` for another shape."""
         if weights.shape != (WEIGHTS,):
             raise SourceError(f"{name}: an NBRDF network has {WEIGHTS} weights, got {weights.shape}")
         self.name = name
@@ -48,7 +49,7 @@ class Nbrdf:
             start += fan_out
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
-        """f cos(theta_o) [1/sr]. The network's output is log(1 + f), its input the half and the difference vector."""
+        """f cos(theta_o) [1/sr]. The network maps the half vector and the difference vector to log(1 + f)."""
         h, d = half_difference(wo, wi)
         logs = network.forward_lanes(self._layers, [*h, *d])
         cosine = dr.select((wi.z > 0) & (wo.z > 0), wo.z, 0.0)
@@ -56,7 +57,7 @@ class Nbrdf:
 
     @staticmethod
     def load(path: str | Path, material: str) -> Nbrdf:
-        """The network of one material of a weights file; `SourceError` says what is wrong with the file or the name."""
+        """The network of one material. Raises `SourceError` for a damaged file, and if it has no such material."""
         names, weights = read(path)
         if material not in names:
             near = difflib.get_close_matches(material, names, 1)
@@ -66,28 +67,26 @@ class Nbrdf:
 
 
 def kind(names: list[str]) -> str:
-    """NBRDF-MERL, NBRDF-RGL, or NBRDF for networks of other materials, from the materials' names."""
+    """NBRDF-MERL or NBRDF-RGL, recognised by the materials' names, or NBRDF for networks of other materials."""
     return next((label for known, label in _FITTED_TO.items() if known in names), "NBRDF")
 
 
 def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
-    """Names (n) and weights (n, 675) of a weights file; `SourceError` says what is wrong with it."""
+    """Names (n) and weights (n, 675) of a weights file. Raises `SourceError` if it is missing or damaged."""
     path = Path(path)
     try:
         with arrays(path) as f:
             names, weights = f["names"], f["weights"]
     except FileNotFoundError:
+        raise SourceError(f"{path}: no such file; `nma data` says where to get NBRDF networks") from None
+    except Exception as e:  # zipfile and zlib raise their own exceptions for damaged archives
         raise SourceError(
-            f"{path}: no such file; see `nma data` for where NBRDF networks come from"
-        ) from None
-    except Exception as e:  # zipfile and zlib raise their own kinds for damaged archives
-        raise SourceError(
-            f"{path}: no weights file of NBRDF networks (.npz with names and weights): {e}"
+            f"{path}: not a weights file of NBRDF networks (.npz with names and weights): {e}"
         ) from None
     if names.dtype.kind != "U" or names.ndim != 1 or weights.shape != (len(names), WEIGHTS):
         raise SourceError(
             f"{path}: names {names.shape} and weights {weights.shape} are not (n,) and (n, {WEIGHTS}); copy it again"
         )
     if weights.dtype.kind != "f" or not np.isfinite(weights).all():
-        raise SourceError(f"{path}: weights hold what is no finite number; copy it again")
+        raise SourceError(f"{path}: some weights are not finite numbers; copy it again")
     return names.tolist(), weights.astype(np.float32)

@@ -1,9 +1,9 @@
-"""The `.bsdf` files of RGL's material database: read and checked here, evaluated by Mitsuba's BSDF `measured`.
+"""The `.bsdf` files of RGL's material database. This module reads and checks them; Mitsuba's `measured` evaluates them.
 
-Dupuy and Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering". A file is a set
-of named arrays behind a header: magic, version, number of fields, and for each its name, rank, type, offset and
-shape. Mitsuba maps it into memory without comparing offsets with its size, so that of a truncated file it reads what
-lies beyond.
+Dupuy and Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering". A file has a
+header and a set of named arrays. The header gives magic, version and number of fields, and for each field its name,
+rank, type, offset and shape. Mitsuba maps the file into memory without checking the offsets against its size, so it
+reads past the end of a truncated file. This is why files are checked here first.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nma.errors import SourceError
 from nma.sources import files
 
 _MAGIC = b"tensor_file\0"
-# Types by their number in the file; others do not occur in materials.
+# NumPy types by their number in the file. Files of materials use no other numbers.
 _TYPES = {
     1: "<u1",
     2: "<i1",
@@ -33,7 +33,7 @@ _TYPES = {
     11: "<f8",
 }
 
-# Fields of a material in RGB with their rank. `rgb` is (phi_i, theta_i, 3, y, x).
+# The fields of a material in RGB and their ranks. `rgb` has the shape (phi_i, theta_i, 3, y, x).
 _FIELDS = {
     "description": 1,
     "phi_i": 1,
@@ -48,7 +48,7 @@ _FIELDS = {
 
 
 def read(path: str | Path) -> dict[str, NDArray]:
-    """The arrays of a material in RGB, by name; `SourceError` says what is wrong with the file."""
+    """The arrays of a material in RGB, by name. Raises `SourceError` with the fault if the file is damaged."""
     path = Path(path)
     fields = read_tensors(path)
     if "rgb" not in fields and "spectra" in fields:
@@ -80,7 +80,7 @@ def read_tensors(path: str | Path) -> dict[str, NDArray]:
 
 
 def _parse(content: bytes) -> dict[str, NDArray]:
-    """The arrays of a tensor file's content."""
+    """The arrays in the `content` of a tensor file, by name."""
     major, minor, count = struct.unpack_from("<BBI", content, 12)
     if (major, minor) != (1, 0):
         raise ValueError(f"version {major}.{minor}")
@@ -98,7 +98,7 @@ def _parse(content: bytes) -> dict[str, NDArray]:
 
 
 def _check_shapes(path: Path, fields: dict[str, NDArray]) -> None:
-    """Refuses fields whose sizes do not belong together."""
+    """Raises `SourceError` if the sizes of the fields do not match."""
     incident = (len(fields["phi_i"]), len(fields["theta_i"]))
     expected = {
         "vndf": (*incident, *fields["vndf"].shape[2:]),
@@ -109,12 +109,15 @@ def _check_shapes(path: Path, fields: dict[str, NDArray]) -> None:
     for name, shape in expected.items():
         if fields[name].shape != shape:
             raise SourceError(
-                f"{path}: field '{name}' has shape {fields[name].shape}, the others want {shape}; copy it again"
+                f"{path}: field '{name}' has shape {fields[name].shape}, expected {shape}; copy it again"
             )
 
 
 def _check_grid(path: Path, name: str, angles: NDArray, low: float, high: float) -> None:
-    """Refuses angles of incidence that do not ascend, among which Mitsuba searches by halves, or that make no sense."""
+    """Raises `SourceError` if angles of incidence do not ascend or are out of range.
+
+    Mitsuba finds an angle by bisection, which needs ascending angles.
+    """
     slack = 1e-4
     if not (
         len(angles)
