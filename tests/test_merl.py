@@ -220,7 +220,7 @@ def test_a_damaged_file_is_refused(tmp_path, content, message):
 
 def test_a_missing_file_is_refused(tmp_path):
     for path, message in (
-        (tmp_path / "no.binary", "no such file; see `nma data`"),
+        (tmp_path / "no.binary", "no such file; `nma data` says where"),
         (tmp_path, "cannot be read"),
     ):
         with pytest.raises(SourceError, match=message) as caught:

@@ -269,7 +269,7 @@ def test_a_damaged_material_is_refused(bsdf_file, tmp_path, cut, message):
 
 
 def test_a_missing_material_is_refused(tmp_path):
-    assert_refused(tmp_path / "no_rgb.bsdf", "no such file; see `nma data`")
+    assert_refused(tmp_path / "no_rgb.bsdf", "no such file; `nma data` says where")
     assert_refused(tmp_path, "cannot be read")
 
 

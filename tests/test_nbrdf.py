@@ -116,8 +116,8 @@ NAMES, WEIGHTS = np.array(["a", "b"]), np.zeros((2, 675), np.float32)
         ({"names": NAMES, "weights": WEIGHTS[:1]}, r"names \(2,\) and weights \(1, 675\)"),
         ({"names": NAMES, "weights": WEIGHTS[:, :-1]}, r"weights \(2, 674\)"),
         ({"names": np.zeros(2), "weights": WEIGHTS}, "are not"),
-        ({"names": NAMES, "weights": WEIGHTS.astype(int)}, "no finite number"),
-        ({"names": NAMES, "weights": WEIGHTS + np.nan}, "no finite number"),
+        ({"names": NAMES, "weights": WEIGHTS.astype(int)}, "not finite numbers"),
+        ({"names": NAMES, "weights": WEIGHTS + np.nan}, "not finite numbers"),
     ],
 )
 def test_a_malformed_weights_file_is_refused(tmp_path, arrays, message):
@@ -127,13 +127,13 @@ def test_a_malformed_weights_file_is_refused(tmp_path, arrays, message):
 
 def test_a_missing_or_damaged_weights_file_is_refused(tmp_path):
     path = tmp_path / "weights.npz"
-    assert_refused(path, "no such file; see `nma data`")
+    assert_refused(path, "no such file; `nma data` says where")
     np.savez(path, names=NAMES, weights=WEIGHTS)
     assert Nbrdf.load(path, "b").name == "NBRDF b"
     whole = path.read_bytes()
     for content in (b"", b"text", whole[: len(whole) // 2]):
         path.write_bytes(content)
-        assert_refused(path, "no weights file")
+        assert_refused(path, "not a weights file")
 
 
 def test_other_numbers_of_weights_are_refused():

@@ -166,7 +166,7 @@ def choose_variant() -> Any:
 
 
 def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> MitsubaBsdf:
-    """The BSDF that `load(mi)` returns, as a source. Raises `SourceError` if Mitsuba fails or returns another object."""
+    """The BSDF that `load(mi)` returns, as a source. Raises `SourceError` if it fails or returns another object."""
     mi = choose_variant()
     try:
         bsdf = load(mi)
