@@ -106,4 +106,4 @@ def test_an_interrupted_command_says_so(nma, monkeypatch):
     monkeypatch.setattr(materials, "names", interrupted)
     code, out, err = nma("materials")
     assert (code, out) == (130, "")
-    assert err == "nma: interrupted; run the same command again to go on where it can be resumed\n"
+    assert err == "nma: interrupted; run the same command again to go on from what it has kept\n"

@@ -19,7 +19,7 @@ from nma.errors import NmaError, one_line
 
 
 class _Commands(TyperGroup):
-    """Ctrl-C ends with a message: typer would end without."""
+    """Ends with a message on Ctrl-C, where typer prints none."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -39,9 +39,8 @@ app = typer.Typer(
     "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
     "[bold]dataset[/bold], learn with [bold]train[/bold], [bold]fit[/bold] and [bold]train-library[/bold], "
     "judge with [bold]evaluate[/bold] and [bold]compare[/bold], look with [bold]render[/bold]. [bold]data[/bold] lists "
-    "measured materials, [bold]library[/bold] learns codes for more of them, [bold]principled[/bold] fits plain "
-    "numbers, "
-    "[bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
+    "measured materials. [bold]library[/bold] adds materials to a library and takes some out. [bold]principled[/bold] "
+    "fits one plain Principled BRDF. [bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
 # Files of this folder, each with the command or the group of its name, in the order of `nma --help`: commands first.
 COMMANDS = (
@@ -96,7 +95,7 @@ def main() -> None:
         _close_stdout()
         _fail(f"{e.filename}: {e.strerror}" if e.filename else str(e))
     except (MemoryError, RuntimeError) as e:
-        # Of Dr.Jit and JAX, it is a RuntimeError that says so.
+        # Dr.Jit and JAX report a lack of memory as a RuntimeError.
         if isinstance(e, RuntimeError) and "out of memory" not in str(e).lower():
             raise
         _fail(
@@ -112,12 +111,15 @@ def _fail(message: str) -> NoReturn:
 
 
 def _interrupted() -> NoReturn:
-    print("nma: interrupted; run the same command again to go on where it can be resumed", file=sys.stderr)
+    print(
+        "nma: interrupted; run the same command again to go on from what it has kept",
+        file=sys.stderr,
+    )
     sys.exit(130)
 
 
 def _close_stdout() -> None:
-    """Where stdout takes no more, a pipe whose reader is gone or a full disk, Python would complain at its end too."""
+    """Gives stdout up where it takes no more: Python would complain of the lost reader or full disk when it ends."""
     try:
         sys.stdout.flush()
     except OSError:

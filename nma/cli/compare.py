@@ -23,16 +23,19 @@ def register(app: typer.Typer) -> None:
 def compare(
     context: typer.Context,
     test: Annotated[
-        str, typer.Argument(help="An image (EXR, PNG, ...), or alone: a material, or the adapter of one.")
+        str,
+        typer.Argument(
+            help="An image (EXR, PNG, ...) to judge. Or, alone, a material or the adapter of one."
+        ),
     ],
-    reference: Annotated[str | None, typer.Argument(help="The image to compare with.")] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
-    ] = False,
+    reference: Annotated[str | None, typer.Argument(help="The image to judge it by.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print nothing but JSON on stdout.")] = False,
     output: Annotated[
-        Path | None, options.output("A PNG with both images and the map of their FLIP.", ".png")
+        Path | None, options.output("A PNG to write, with both images and the map of their FLIP.", ".png")
     ] = None,
-    exposure: Annotated[float, options.exposure("Stops before ssim, flip_ldr and in the PNG.")] = 0.0,
+    exposure: Annotated[
+        float, options.exposure("Stops that brighten the images for ssim, flip_ldr and the PNG.")
+    ] = 0.0,
     adapter: options.AdapterName = "layered3-5x64",
     clamp: options.Clamp = False,
     changes: options.Changes = None,
@@ -45,10 +48,10 @@ def compare(
     seed: options.PictureSeed = 0,
     variant: options.MitsubaVariant = "auto",
 ) -> None:
-    """Compare two images; or, for a material, its adapter with its reference, both rendered in the preview scene.
+    """Compare two images. Or, for a material, render its adapter and its reference and compare those.
 
-    A material's reference is rendered twice, and the column `noise` says what it scores against itself: its noise.
-    The figures are defined in docs/evaluation.md.
+    The reference of a material is rendered twice. The column `noise` compares these two pictures, which differ by their
+    noise alone. The figures are defined in docs/evaluation.md.
 
     Examples: [bold]nma compare test.exr reference.exr -o difference.png[/bold],
     [bold]nma compare gold-red-lacquer --spp 512[/bold]
@@ -68,7 +71,7 @@ def compare(
         material, adapter = preview.subject(context, test, changes, adapter)
         if not material.values:
             raise ParamError(
-                f"{test} knows a material that cannot be simulated; render both and compare the images"
+                f"{test}: its material cannot be simulated; render both yourself and compare the images"
             )
         view = preview.View(pixels, spp, depth, camera, lighting, envmap, variant)
         pictures = _renderings(material, view, seed, adapter, clamp)
@@ -91,7 +94,7 @@ def compare(
 def _renderings(
     material: Material, view: preview.View, seed: int, adapter: str, clamp: bool
 ) -> dict[str, Any]:
-    """A material by its adapter, by its reference, and by the reference again, each with a seed of its own."""
+    """Pictures of a material: one by its adapter, two by its reference. Each has its own seed."""
     by_adapter = view.load(material, "nma", adapter, clamp)
     by_walks = view.load(material, "layered")
     return {

@@ -21,15 +21,15 @@ __all__ = ["TrainingBar", "counting", "err", "loss_plot", "number", "out", "prog
 out = Console()
 
 _GAP = 2
-# Longer cells are sentences, which may be broken between words.
+# A cell longer than this is a sentence, which may be broken between words.
 _SENTENCE = 24
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None) -> Group:
-    """A table that fits the terminal: sentences are broken between words, numbers never are.
+    """A table that fits the terminal. Sentences are broken between words, numbers never.
 
-    Columns that do not fit go into a second table below the first, and so on, with the first column repeated. Brackets
-    are no markup in it.
+    Columns that do not fit go into a second table below, then a third. Each repeats the first column. Brackets are
+    printed as they are: they are no markup.
     """
     cells = [[number(cell) if isinstance(cell, float) else str(cell) for cell in row] for row in rows]
     columns = [
@@ -40,12 +40,12 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str 
 
 
 def say(text: str) -> None:
-    """A line on stderr as it is: paths are not broken, and brackets are no markup."""
+    """Prints a line on stderr as it is. Long paths stay in one piece, and brackets are no markup."""
     err.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 def tell(text: str) -> None:
-    """The same on stdout."""
+    """Prints a line on stdout, as `say` does on stderr."""
     out.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
@@ -71,18 +71,18 @@ def counting(
 
 
 def number(value: float) -> str:
-    """Four digits, as short as can be: .01382 and 6.5e-06."""
+    """A number as text: with four digits, .01382, or with two where it is tiny, 6.5e-06."""
     text = f"{value:.4g}" if abs(value) >= 1e-4 or value == 0 else f"{value:.1e}"
     return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text
 
 
 def loss_plot(output: Path) -> Path:
-    """Where the losses of a training run are drawn: beside its weights."""
+    """The file for a plot of the losses of training. It lies beside the weights, `output`."""
     return output.with_suffix(".loss.png")
 
 
 class _Column:
-    """A column; `width` is what it needs at least."""
+    """A column of a table. It needs at least `width` letters."""
 
     def __init__(self, heading: str, cells: Sequence[str], first: bool):
         widest = max(map(cell_len, cells), default=0)
@@ -96,7 +96,7 @@ class _Column:
 
 
 def _parts(columns: Sequence[_Column]) -> list[list[_Column]]:
-    """The columns behind the first, in as few tables as hold them."""
+    """The columns after the first, divided among as few tables as can hold them."""
     parts: list[list[_Column]] = [[]]
     room = out.width - columns[0].width
     for column in columns[1:]:

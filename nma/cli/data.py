@@ -1,4 +1,4 @@
-"""`nma data`: measured materials and their reconstructions, where to get them and whether a copy is sound."""
+"""`nma data`: measured materials and their reconstructions. Where do they come from, and is a copy sound?"""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from nma.cli import console, options, reading
 
 data = typer.Typer(
     invoke_without_command=True,
-    help="List the data sets of measured materials that sources read: origin, terms, files. Nothing is downloaded. "
-    "[bold]check[/bold] looks at copies of them, [bold]merl[/bold] writes any isotropic material in MERL's format.",
+    help="List the measured materials that this package reads: their origin, terms and files. Nothing is downloaded. "
+    "[bold]check[/bold] checks your copies. [bold]merl[/bold] writes any isotropic material in MERL's format.",
 )
 
 
@@ -40,8 +40,8 @@ def listing(context: typer.Context) -> None:
 
 
 @data.command()
-def check(path: Annotated[Path, typer.Argument(help="A file, or a folder that holds files.")]) -> None:
-    """Check files of these data sets: size, structure, values, and checksum where one is known.
+def check(path: Annotated[Path, typer.Argument(help="A file, or a folder with files.")]) -> None:
+    """Check files of measurements: their size, structure, values and, where it is known, checksum.
 
     The exit status is 1 if a file has a fault.
     """
@@ -60,21 +60,23 @@ def merl(
     source: Annotated[
         str,
         typer.Argument(
-            help="A file of values (.bsdf, .xml, .binary, NBRDF's .npz), the adapter of a single material "
-            "(.safetensors), or a named material or material file (.toml), which --adapter evaluates."
+            help="A file of values (.bsdf, .xml, .binary, NBRDF's .npz); the adapter of a single material "
+            "(.safetensors); or a named material or a material file (.toml), which --adapter evaluates."
         ),
     ],
     output: Annotated[Path, options.output("The file to write.", ".binary")],
-    material: Annotated[str | None, typer.Option(help="Which network of an NBRDF file.")] = None,
+    material: Annotated[
+        str | None, typer.Option(help="Which material of an NBRDF file: the name of its network.")
+    ] = None,
     adapter: Annotated[
         str,
         typer.Option(
-            help="A shipped adapter's name or a weights file, for named materials and material files."
+            help="What evaluates named materials and material files: a shipped adapter's name or a weights file."
         ),
     ] = "layered3-5x64",
     clamp: options.Clamp = False,
 ) -> None:
-    """Write any isotropic material as a MERL file: 90 x 90 x 180 values at half and difference angles.
+    """Write any isotropic material as a MERL file: 90 x 90 x 180 values over half and difference angles.
 
     Example: [bold]nma data merl gold-red-lacquer -o gold.binary[/bold]
     """

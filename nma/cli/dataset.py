@@ -25,7 +25,7 @@ def dataset(
         str, options.choice("Where conductors come from.", *options.POPULATIONS[:-1])
     ] = "mixed",
 ) -> None:
-    """Sample a class into a dataset for training. Resumes what was killed; several workers may write one dataset."""
+    """Sample a class into a dataset for training. If killed, run it again. Several runs may fill it together."""
     from nma.table.dataset import Dataset, Settings
 
     files.try_folder(output)
@@ -47,7 +47,7 @@ def dataset(
 
 
 def _span(seconds: float) -> str:
-    """So long, in the unit that suits it."""
+    """A time in the largest unit of which it has at least two."""
     for unit, size in (("days", 86_400), ("hours", 3600), ("minutes", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.1f} {unit}"

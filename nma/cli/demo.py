@@ -20,14 +20,16 @@ def demo(
     adapter: options.AdapterName = "layered3-5x64",
     size: options.Size = "256",
     spp: Annotated[int, options.samples("Samples per pixel of the frames that are timed.")] = 64,
-    runs: Annotated[int, options.number("Frames of each kind, with seeds of their own.", 2, 1000)] = 2,
+    runs: Annotated[
+        int, options.number("How many frames of each kind are timed, each with its own seed.", 2, 1000)
+    ] = 2,
     reference_spp: Annotated[int, options.samples("Samples per pixel of the converged reference.")] = 144,
     variant: options.MitsubaVariant = "auto",
 ) -> None:
-    """See it work: a plain and a textured layered material, by reference and by adapter, with time, variance and error.
+    """See it work: two layered materials, by reference and by adapter, with time, variance and error.
 
-    Writes a sheet of pictures as soon as there are some, again whenever there is more to show, and prints the table
-    below it. Takes about a minute on two CPU cores.
+    One of the materials is plain, the other is textured. The command writes a sheet of pictures, again whenever there
+    is more to show, and prints its figures as a table. It takes about a minute on two CPU cores.
     """
     from nma.images import metrics
 

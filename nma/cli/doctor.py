@@ -1,4 +1,4 @@
-"""`nma doctor`: what this machine lacks."""
+"""`nma doctor`: what is missing on this machine."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor() -> None:
-    """Check that everything the package needs is there; print the command that mends what is not."""
+    """Check that everything the package needs is there. For what is missing, print the command that mends it."""
     from nma.doctor import check
 
     findings = check()
     rows = [(f.name, "ok" if f.ok else "optional" if f.optional else "MISSING", f.found) for f in findings]
     console.out.print(console.table(("what", "state", "found"), rows))
-    # Commands stand alone, unbroken, to be copied.
+    # Each command has a line of its own, unbroken, so that it can be copied.
     for f in findings:
         if not f.ok:
             console.tell(f"\n{f.name}:\n  {f.fix}")

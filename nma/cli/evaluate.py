@@ -19,15 +19,13 @@ def register(app: typer.Typer) -> None:
 def evaluate(
     weights: Annotated[str, typer.Argument(help="A weights file or the name of a shipped adapter.")],
     reference: Annotated[Path, typer.Option(help="A reference file made by `nma simulate`.")],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON on stdout and nothing else there.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print nothing but JSON on stdout.")] = False,
     clamp: options.Clamp = False,
 ) -> None:
-    """Compare an adapter with reference tables over the paper's bins: means over bins and RGB, then over materials.
+    """Compare an adapter with reference tables, bin by bin: one line of figures per material, and their means.
 
-    The adapter's own bin averages are integrated with points in every bin and samples of its narrow lobes; the line
-    below the table says how exact they are. See docs/evaluation.md for every figure's formula.
+    The adapter's bin averages are integrated numerically. The line below the table says how exact they are. The
+    formulas of the figures are in docs/evaluation.md.
     """
     from nma.adapter import Adapter
     from nma.evaluate import evaluate as run
@@ -52,10 +50,10 @@ def evaluate(
     )
     if result.estimated_error:
         console.out.print(
-            "The reference has no standard errors; its noise floor is an upper bound from counting walks."
+            "The reference has no standard errors. Its noise floor is an upper bound, from the number of walks."
         )
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
-    """The figures for JSON, which has no infinity: the PSNR of equal tables becomes null."""
+    """The figures for JSON. It has no infinity, so the PSNR of equal tables becomes null."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}

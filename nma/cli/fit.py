@@ -18,18 +18,18 @@ def fit(
     source: Annotated[
         str,
         typer.Argument(
-            help="A named material or a material file (.toml), which is simulated; a file of values (.bsdf, .binary, "
-            ".xml, NBRDF's .npz); or a reference file (.npz)."
+            help="A named material or a material file (.toml), which are simulated; a file of values (.bsdf, "
+            ".binary, .xml, NBRDF's .npz); or a reference file (.npz)."
         ),
     ],
     output: options.Weights,
     material: Annotated[
         str | None,
         typer.Option(
-            help="Which material of a file that holds several: a name, or a number in a reference file."
+            help="Which material of an .npz file: the name of a network, or the number of a table, from 0."
         ),
     ] = None,
-    walks: Annotated[int, options.walks("Walks of the table of a simulated material.")] = 64_000_000,
+    walks: Annotated[int, options.walks("Random walks, if the material is simulated.")] = 64_000_000,
     variant: options.Variant = "blended+omega_i",
     network: options.Network = None,
     target: options.Target = None,
@@ -42,7 +42,7 @@ def fit(
     learning_rate: options.Rate = None,
     seed: options.TrainingSeed = 0,
 ) -> None:
-    """Overfit one material: train a small network on its values, or on its table. See docs/bring-your-own.md.
+    """Train a small network on one material alone: on its values or on its table. See docs/bring-your-own.md.
 
     Examples: [bold]nma fit gold-red-lacquer -o gold.safetensors[/bold],
     [bold]nma fit paper_white_rgb.bsdf -o paper.safetensors[/bold]
@@ -79,7 +79,7 @@ def fit(
 
 
 def _compare(adapter, source) -> None:
-    """Says how far the adapter is from a source with values."""
+    """Prints how far the adapter is from its source, which has values."""
     from nma.adapter.values import AdapterValues
     from nma.evaluate.pairs import PAIRS, compare
 

@@ -10,7 +10,7 @@ import typer
 from nma.cli import console
 
 _ABOUT_THE_LOSS = (
-    "The log loss of training is against tables as noisy as their walks leave them, so that it holds their noise too. "
+    "The log loss of training is measured against noisy tables, so that it holds their noise too. "
     "`nma evaluate` says how far an adapter is from a reference, and how much noise the reference has."
 )
 
@@ -20,10 +20,10 @@ def register(app: typer.Typer) -> None:
 
 
 def info(
-    weights: Annotated[str | None, typer.Argument(help="A weights file or a shipped adapter's name.")] = None,
+    weights: Annotated[str | None, typer.Argument(help="A shipped adapter's name or a weights file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show what a weights file says about itself: class, network, ranges, training. Without one, list those shipped."""
+    """Show what a weights file says about itself: class, network, ranges, training. Or list the shipped adapters."""
     from nma import network
     from nma.adapter import Adapter, shipped
     from nma.target.principled import DIALECT
@@ -63,7 +63,7 @@ def info(
 
 
 def _plain(value: Any) -> str:
-    """A fact for people: numbers of four digits, without the brackets of Python."""
+    """A fact as people read it: numbers of four digits, lists without brackets."""
     if isinstance(value, float):
         return console.number(value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""`nma train-library`, `nma library`: many materials in one network, and codes for more of them."""
+"""`nma train-library`, `nma library`: many materials in one network, each with a code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from nma import files
 from nma.cli import console, options, training
 
 library = typer.Typer(
-    no_args_is_help=True, help="Look at a library, learn the code of one more material, take one out."
+    no_args_is_help=True,
+    help="List the materials of a library, add one, or write one as an adapter of its own.",
 )
 
 _Library = Annotated[Path, typer.Argument(metavar="LIBRARY", help="A library that `nma train-library` made.")]
@@ -29,7 +30,8 @@ def train_library(
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="DIR", help="A folder with files of materials, or one NBRDF weights file (.npz)."
+            metavar="DIR",
+            help="A folder with files of values, or a single such file, for example NBRDF weights (.npz).",
         ),
     ],
     output: options.Weights,
@@ -40,7 +42,7 @@ def train_library(
 ) -> None:
     """Train one small network on many materials, with a code for each: a library (paper Fig. 12).
 
-    Tables wait in OUTPUT.tables, training in OUTPUT.ckpt: a killed run goes on when the command is repeated.
+    If killed, run it again: it goes on from the tables in OUTPUT.tables and the checkpoint OUTPUT.ckpt.
 
     Example: [bold]nma train-library ~/merl -o library.safetensors[/bold]
     """
@@ -87,16 +89,17 @@ def listing(path: _Library) -> None:
 @library.command()
 def encode(
     path: _Library,
-    source: Annotated[Path, typer.Argument(help="A file with the new material's values.")],
-    output: Annotated[Path, options.output("The library with one material more.", ".safetensors")],
-    material: Annotated[str | None, typer.Option(help="Which one, in a file of several.")] = None,
+    source: Annotated[Path, typer.Argument(help="A file with the values of the new material.")],
+    output: Annotated[Path, options.output("The library to write, with one more material.", ".safetensors")],
+    material: Annotated[str | None, typer.Option(help="Which material, if the file holds several.")] = None,
     name: Annotated[
-        str | None, typer.Option(help="What to call it; without, its own name or the file's.")
+        str | None,
+        typer.Option(help="What to call the new material: its own name or the file's, unless given."),
     ] = None,
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the batches.")] = 0,
 ) -> None:
-    """Learn the code of a material that the library has not seen; its network stays as it is.
+    """Learn the code of a material that the library has not seen. The network stays as it is.
 
     Example: [bold]nma library encode library.safetensors paper_white_rgb.bsdf -o more.safetensors[/bold]
     """
@@ -110,7 +113,7 @@ def encode(
     known = Library.load(path)
     name = name or material or source.stem
     if name in known.names:
-        raise ParamError(f"{path} has a material '{name}'; give the new one another with --name")
+        raise ParamError(f"{path} has a material '{name}'; give the new one another name with --name")
     values = sources.read(source, material)
     with console.err.status(f"tabulating {values.name}"):
         tables = tabulate_values(values)
@@ -130,11 +133,12 @@ def encode(
 def extract(
     path: _Library,
     materials: Annotated[
-        list[str], typer.Argument(help="A material's name, or NAME=WEIGHT of several to mix their codes.")
+        list[str],
+        typer.Argument(help="The name of a material; or several NAME=WEIGHT, whose codes are mixed."),
     ],
     output: options.Weights,
 ) -> None:
-    """Write one material of a library, or a mixture of some, as an adapter of its own.
+    """Write one material of a library, or a mixture of several, as an adapter of its own.
 
     Example: [bold]nma library extract library.safetensors brass=.7 blue-rubber=.3 -o mixed.safetensors[/bold]
     """
@@ -154,4 +158,6 @@ def _share(text: str) -> tuple[str, float]:
     try:
         return name, float(number) if equals else 1.0
     except ValueError:
-        raise typer.BadParameter(f"'{text}' is no NAME=WEIGHT with a number as its weight") from None
+        raise typer.BadParameter(
+            f"'{text}' is not of the form NAME=WEIGHT, with a number as the weight"
+        ) from None

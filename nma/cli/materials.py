@@ -21,11 +21,13 @@ def register(app: typer.Typer) -> None:
 def materials(
     name: Annotated[
         str | None,
-        typer.Argument(help="Show this material's parameters, or those of a material file (.toml)."),
+        typer.Argument(help="A named material or a material file (.toml), whose parameters are shown."),
     ] = None,
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="Print JSON on stdout and nothing else there: all digits, for programs."),
+        typer.Option(
+            "--json", help="Print nothing but JSON on stdout: numbers with all digits, for programs."
+        ),
     ] = False,
 ) -> None:
     """List the named materials, or show one of them."""
@@ -55,7 +57,7 @@ def materials(
 
 
 def _facts(material: Material) -> dict[str, Any]:
-    """A material for other programs: its vector in the order of the class, null where images drive it, and by name."""
+    """A material for other programs. `parameters` is its vector in the order of the class, None if it has images."""
     from nma.materials import Texture
 
     values = {

@@ -1,4 +1,4 @@
-"""`nma mitsuba`: the plugins of the scalar renderer."""
+"""`nma mitsuba`: plugins for Mitsuba's scalar renderer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 @mitsuba.command()
 def build() -> None:
-    """Compile the BSDFs nma and layered for scalar_rgb against the installed Mitsuba, some ten seconds, once."""
+    """Compile the BSDFs nma and layered for scalar_rgb and the installed Mitsuba. It takes about ten seconds, once."""
     from nma.native import build
 
     folder = build.build_mitsuba(console.say)

@@ -1,4 +1,4 @@
-"""Options that several commands share. Numbers have a smallest and a largest value, where they are declared."""
+"""Options that several commands share. Each number is declared with its smallest and its largest value."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import typer
 
 
 def number(help: str, low: float, high: float, **more: Any) -> Any:
-    """A number between two bounds, both included; NaN lies outside."""
+    """A number between two bounds, both included. NaN is refused."""
     return typer.Option(min=low, max=high, help=help, callback=_no_nan, **more)
 
 
 def _no_nan(value: float | None) -> float | None:
-    """Which no bounds of typer's keep out, in some of its versions."""
+    """Refuses NaN, which some versions of typer let through whatever the bounds."""
     if value is not None and value != value:
         raise typer.BadParameter("NaN is no number between the bounds")
     return value
@@ -29,7 +29,7 @@ def seed(help: str) -> Any:
 
 
 def samples(help: str, **more: Any) -> Any:
-    """Samples per pixel."""
+    """A number of samples per pixel."""
     return number(help, 1, 2**16, **more)
 
 
@@ -38,7 +38,7 @@ def exposure(help: str) -> Any:
 
 
 def choice(help: str, *values: str) -> Any:
-    """One of some words."""
+    """One of the words `values`."""
 
     def check(value: str | None) -> str | None:
         if value is not None and value not in values:
@@ -49,7 +49,7 @@ def choice(help: str, *values: str) -> Any:
 
 
 def output(help: str, *endings: str, **more: Any) -> Any:
-    """A file to write, whose name ends as those do that read it."""
+    """A file to write. Its name must have one of the endings that the readers of such files accept."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None and path.suffix not in endings:
@@ -60,7 +60,7 @@ def output(help: str, *endings: str, **more: Any) -> Any:
 
 
 def _network(name: str | None) -> str | None:
-    """Refused at once rather than after the simulation of a material."""
+    """Refuses a wrong network at once, before a material is simulated for it."""
     if name is not None:
         from nma.network import hidden
 
@@ -68,17 +68,19 @@ def _network(name: str | None) -> str | None:
     return name
 
 
-# As `nma.train.recipe.Recipe` and `nma.params` declare them.
+# The words that `nma.train.recipe.Recipe` and `nma.params` declare.
 TARGETS = ("principled", "stretched", "measured", "anisotropic")
 POINTS_LAWS = ("crowded", "uniform", "centre")
 LOSSES = ("huber", "log")
 POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
-# Of the paper: how many instances, and whether they follow the view direction.
+# The paper's variants: how many instances there are, and whether they follow the view direction.
 VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
 
-# Of training.
+# Options of commands that train.
 Weights = Annotated[Path, output("The weights file to write.", ".safetensors")]
-Variant = Annotated[str, choice("Whether two instances are blended, and follow the direction.", *VARIANTS)]
+Variant = Annotated[
+    str, choice("blended: two instances. omega_i: their parameters follow the view direction.", *VARIANTS)
+]
 Network = Annotated[
     str | None,
     typer.Option(help="Hidden layers, DEPTHxWIDTH, for example 5x64 or 3x32.", callback=_network),
@@ -86,31 +88,45 @@ Network = Annotated[
 Target = Annotated[
     str | None,
     choice(
-        "The first has the paper's 11 numbers, the second stretches lobes along the plane of incidence, the third "
-        "lets them fade out, too, the last does the same along the surface's axes.",
+        "principled: the paper's 11 numbers per instance. stretched: lobes can also stretch along the plane of "
+        "incidence. measured: they can also fade out. anisotropic: as measured, along the axes of the surface.",
         *TARGETS,
     ),
 ]
 Steps = Annotated[int | None, number("Number of optimisation steps.", 1, 10**9)]
-Points = Annotated[int | None, number("Points per bin of the AvA estimate (eq. 6).", 1, 4096)]
+Points = Annotated[int | None, number("Points per bin, from which its mean is estimated (eq. 6).", 1, 4096)]
 PointsLaw = Annotated[
-    str | None, choice("Where points lie: centre is point supervision, uniform the paper's.", *POINTS_LAWS)
+    str | None,
+    choice(
+        "Where the points of a bin lie. crowded: denser towards the mirror direction. uniform: as in the paper. "
+        "centre: one in the middle (point supervision).",
+        *POINTS_LAWS,
+    ),
 ]
-Finest = Annotated[float | None, number("Microfacet width down to which points crowd.", 1e-6, 1)]
-Loss = Annotated[str | None, choice("log is the paper's eq. 7.", *LOSSES)]
-Albedo = Annotated[float | None, number("Weight of the error of the directional albedo; 0: none.", 0, 1e6)]
+Finest = Annotated[
+    float | None, number("The microfacet width down to which crowded points get denser.", 1e-6, 1)
+]
+Loss = Annotated[
+    str | None, choice("log: the paper's eq. 7. huber: quadratic within the noise of a bin.", *LOSSES)
+]
+Albedo = Annotated[
+    float | None, number("Weight of the error of the directional albedo; 0 turns it off.", 0, 1e6)
+]
 Rate = Annotated[
-    float | None, number("Learning rate of Adam, its peak under the one-cycle schedule.", 1e-9, 10)
+    float | None, number("Learning rate of Adam; under the one-cycle schedule, its peak.", 1e-9, 10)
 ]
 TrainingSeed = Annotated[int, seed("Seed of the weights, of the batches and of a simulated table.")]
 
-# Of adapters at work.
+# Options of commands that use an adapter.
 AdapterName = Annotated[str, typer.Option(help="A shipped adapter's name or a weights file.")]
 Clamp = Annotated[
-    bool, typer.Option("--clamp", help="Move parameters beyond the adapter's training range to the range.")
+    bool,
+    typer.Option(
+        "--clamp", help="Move parameters outside the adapter's training range to its nearest bound."
+    ),
 ]
 
-# Of pictures.
+# Options of commands that render.
 Changes = Annotated[
     list[str] | None,
     typer.Option(
@@ -122,13 +138,14 @@ Changes = Annotated[
 ]
 Camera = Annotated[str, typer.Option(help="hero, close or top.")]
 Lighting = Annotated[
-    str, typer.Option(help="studio, softboxes in a dim dome, or outdoors, sun, sky and a small lamp.")
+    str, typer.Option(help="studio: softboxes in a dim dome. outdoors: sun, sky and a small lamp.")
 ]
 Envmap = Annotated[
-    Path | None, typer.Option(help="Light by this environment map (EXR or HDR), instead of --lighting.")
+    Path | None,
+    typer.Option(help="Light the scene by this environment map (EXR or HDR), instead of --lighting."),
 ]
 Size = Annotated[str, typer.Option(help="Pixels: 512 for a square, or 512x384.")]
-Depth = Annotated[int, number("Longest path, in edges.", 1, 1000)]
+Depth = Annotated[int, number("Longest light path, in edges.", 1, 1000)]
 PictureSeed = Annotated[int, seed("Equal seeds give equal pictures.")]
 MitsubaVariant = Annotated[
     str,

@@ -22,7 +22,7 @@ OPTIONS = ("adapter", "clamp", "changes", "camera", "lighting", "envmap", "mesh"
 
 
 class View(NamedTuple):
-    """How the preview scene is looked at."""
+    """How the preview scene is shown: size, samples, light, camera, and the mesh in it."""
 
     size: tuple[int, int]
     spp: int
@@ -35,7 +35,7 @@ class View(NamedTuple):
     mesh_up: str = "z"
 
     def load(self, material: Material, model: str, adapter: str = "", clamp: bool = False) -> Any:
-        """The scene with this material."""
+        """The preview scene with this material."""
         from nma.render import load, progressive, scene
 
         use_rgb(self.variant)
@@ -49,7 +49,7 @@ class View(NamedTuple):
 
 
 def use_rgb(variant: str) -> None:
-    """Chooses the variant for materials, whose parameters are RGB."""
+    """Chooses Mitsuba's variant. It must be RGB, as the parameters of materials are."""
     import nma.render
 
     if not variant.endswith("_rgb") and variant != "auto":
@@ -113,7 +113,7 @@ def pixels(text: str) -> tuple[int, int]:
 
 
 def refuse(context: typer.Context, names: tuple[str, ...], subject: str) -> None:
-    """An option that would do nothing is a mistake."""
+    """Refuses the options that would do nothing for this subject, if the user gave them."""
     given = [name for name in names if _given(context, name)]
     if given:
         flags = ", ".join("--set" if name == "changes" else f"--{name.replace('_', '-')}" for name in given)

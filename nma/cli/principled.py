@@ -12,7 +12,7 @@ import typer
 from nma import files
 from nma.cli import console, options, reading
 
-# Mean error of the directional albedo above which plain numbers come with a warning: it shows in pictures.
+# A mean error of the directional albedo above this shows in pictures, so a warning is printed.
 ALBEDO_LIMIT = 0.05
 
 
@@ -24,30 +24,32 @@ def principled(
     source: Annotated[
         str,
         typer.Argument(
-            help="A named material, a material file (.toml), measured or other values (.binary, .bsdf, .xml, .npz), or "
-            "a reference file (.npz)."
+            help="A named material or a material file (.toml), which are simulated; a file of values (.bsdf, "
+            ".binary, .xml, NBRDF's .npz); or a reference file (.npz)."
         ),
     ],
     material: Annotated[
         str | None,
-        typer.Option(help="Which one of an .npz file: a network's name, or the number of a table, from 0."),
+        typer.Option(
+            help="Which material of an .npz file: the name of a network, or the number of a table, from 0."
+        ),
     ] = None,
     output: Annotated[
         Path | None,
         options.output(
-            "A file to write as well: Mitsuba's .xml, .json, or weights (.safetensors).",
+            "A file to write too: a scene element for Mitsuba (.xml), .json, or weights (.safetensors).",
             ".xml",
             ".json",
             ".safetensors",
         ),
     ] = None,
-    walks: Annotated[int, options.walks("Walks of the table, if the material is simulated.")] = 16_000_000,
+    walks: Annotated[int, options.walks("Random walks, if the material is simulated.")] = 16_000_000,
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the walks and of the batches.")] = 0,
 ) -> None:
-    """Fit the constant parameters of one plain Principled BRDF, and print them as a dictionary of Mitsuba's.
+    """Fit one plain Principled BRDF to a material, and print its parameters as a dictionary for Mitsuba.
 
-    No network, no blend, no dependence on the direction: numbers for any renderer with such a BRDF.
+    There is no network, no blend and no dependence on the direction: any renderer with such a BRDF takes the numbers.
 
     Examples: [bold]nma principled gold-red-lacquer -o gold.xml[/bold],
     [bold]nma principled paper_white_rgb.bsdf[/bold]
@@ -82,12 +84,12 @@ def principled(
 
 
 def _warning(error: float, brightness: float) -> str:
-    """What to know of numbers that cannot show the material."""
+    """The warning for a fit that cannot show the material."""
     percent = 100.0 * (brightness - 1.0)
     tone = "bright" if percent > 0 else "dark"
     return (
         f"warning: an albedo error of {error:.4f} is above {ALBEDO_LIMIT:g} ({abs(percent):.1f} % too {tone} in all): "
-        "one plain Principled BRDF cannot show this material, an adapter of `nma fit` can"
+        "one plain Principled BRDF cannot show this material; an adapter can, which `nma fit` makes"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a command's SOURCE means: any description of one material, as what is known of it or as its table."""
+"""Reads what the arguments of commands name: a MATERIAL with its changes, or the SOURCE of one material."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 
 
 def material_of(name: str, changes: list[str] | None) -> Material:
-    """A named material, a material file, or an adapter that knows a single one; with `changes` given by --set."""
+    """A named material, a material file, or the material of an adapter that knows a single one.
+
+    `changes` are those of --set, which change a material but not an adapter. Raises `NmaError` for what cannot be read.
+    """
     from nma import materials
     from nma.adapter import Adapter
     from nma.params import MEASURED
 
     if name.endswith(".safetensors"):
-        # An adapter that knows a single material is one.
         adapter = Adapter.load(name)
         if adapter.space.size and adapter.material is None:
             raise ParamError(
@@ -43,21 +45,19 @@ def material_of(name: str, changes: list[str] | None) -> Material:
 def known_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Values | Tables, dict[str, Any]]:
-    """What is known of one material, its values or its table, and the record of where that comes from.
+    """What is known of one material, and the record of its origin.
 
-    `source` is a named material or a material file (.toml), which are simulated with so many `walks`; a file that
-    `nma.sources.read` understands, which has values; or a reference file (.npz). `material` chooses in a file that
-    holds several: by name among NBRDF networks, by number in a reference file.
+    A named material or a material file (.toml) is simulated with so many `walks`: its table is known. So is the table
+    in a reference file (.npz). A file that `nma.sources.read` reads has values. `material` chooses from a file of
+    several materials: the name of an NBRDF network, or the number of a table.
 
-    The record has `data`, the kind and name of the source, `material`, the material's name, and for simulations
-    `walks_per_material`. Raises `NmaError` for what cannot be read.
+    The record has `data` (kind and name of the source), `material` (its name) and, for tables, `walks_per_material`.
+    Raises `NmaError` for what cannot be read.
     """
-    from nma import materials
-
     path = _path(source, material)
     if path.suffix == ".npz":
         return _reference(path, material) if _holds_tables(path) else _values(path, material)
-    if path.suffix in ("", ".toml") or source in materials.names():
+    if _is_material(source):
         return _simulated(source, walks, seed)
     return _values(path, None)
 
@@ -65,8 +65,11 @@ def known_of(
 def tables_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Tables, dict[str, Any]]:
-    """The isotropic table of one material, and the record, as of `known_of`, with the number of `points_per_bin` where
-    values were averaged over bins. Raises `SourceError` for anisotropic materials."""
+    """The table of one isotropic material, and the record of its origin, as `known_of` gives them.
+
+    Values are averaged over bins. The record then has the number of points in each, `points_per_bin`. Raises
+    `SourceError` for anisotropic materials.
+    """
     from nma.table import Tables
     from nma.table.values import POINTS, tabulate_values
 
@@ -82,26 +85,35 @@ def tables_of(
 
 
 def values_of(source: str, material: str | None, adapter: str, clamp: bool = False) -> Values:
-    """What has a value at any pair of directions: a file of values, the adapter of a single material (.safetensors), or
-    a named material or material file as `adapter` shows it, whose parameters `clamp` moves to its training range.
+    """A source with a value at any pair of directions.
 
-    Raises `NmaError` for what cannot be read, and for tables, which hold means over bins.
+    It is a file of values, the adapter of a single material (.safetensors), or a named material or a material file
+    (.toml) as `adapter` shows it. `clamp` moves its parameters into the training range of that adapter.
+
+    Raises `NmaError` for what cannot be read, and for tables: they hold means over bins.
     """
     from nma import materials
     from nma.adapter import Adapter
     from nma.adapter.values import AdapterValues
 
     path = _path(source, material)
-    if path.suffix == ".npz" and _is_reference(path):
+    if path.suffix == ".npz" and path.is_file() and _holds_tables(path):
         raise TableError(
-            f"{path}: holds tables, whose bins are too wide; fit it first: nma fit {path} -o X.safetensors"
+            f"{path}: holds tables, whose bins are too wide; fit an adapter first: nma fit {path} -o X.safetensors"
         )
     if path.suffix == ".safetensors":
         return AdapterValues(Adapter.load(path), name=path.stem)
-    if path.suffix in ("", ".toml") or source in materials.names():
+    if _is_material(source):
         known, network = materials.load(source), Adapter.load(adapter)
         return AdapterValues(network, network.check(known.vector(), clamp)[0], known.name)
     return _values(path, material)[0]
+
+
+def _is_material(source: str) -> bool:
+    """Whether this is a MATERIAL, by its name or by that of its file."""
+    from nma import materials
+
+    return Path(source).suffix in ("", ".toml") or source in materials.names()
 
 
 def _path(source: str, material: str | None) -> Path:
@@ -147,7 +159,7 @@ def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]
 
 
 def _number(path: Path, count: int, material: str | None) -> int:
-    """Which of a reference file's materials is meant."""
+    """Which material of a reference file is meant."""
     if material is None and count == 1:
         return 0
     if material is None or not re.fullmatch(r"\d{1,9}", material, re.ASCII) or int(material) >= count:
@@ -158,21 +170,17 @@ def _number(path: Path, count: int, material: str | None) -> int:
     return int(material)
 
 
-def _is_reference(path: Path) -> bool:
-    return path.is_file() and _holds_tables(path)
-
-
 def _holds_tables(path: Path) -> bool:
-    """Whether an .npz file is a reference file; those of NBRDF networks have other arrays."""
+    """Whether an .npz file is a reference file. Files of NBRDF networks have other arrays."""
     try:
         with arrays(path) as f:
             return "weights" not in f
-    except Exception:  # whoever reads it says what is wrong
+    except Exception:  # the reader will say what is wrong
         return True
 
 
 def change_of(text: str) -> tuple[str, Any]:
-    """`alpha_top=.2` and the like, as in a material file."""
+    """Name and value of a change such as `alpha_top=.2`; the value is one that a material file may have."""
     name, value = assignment(text)
     try:
         numbers = [float(part) for part in value.split(",")]
@@ -182,7 +190,7 @@ def change_of(text: str) -> tuple[str, Any]:
 
 
 def _texture(text: str) -> dict[str, Any]:
-    """`orm.png,channel=g,uv_scale=4` as a material file's table; what is no option belongs to the file's name."""
+    """`orm.png,channel=g,uv_scale=4` as a table of a material file. The file's name may have commas."""
     from nma.materials import TEXTURE_OPTIONS
 
     file, *parts = re.split(rf",(?=(?:{'|'.join(TEXTURE_OPTIONS)})=)", text)

@@ -27,10 +27,10 @@ def render(
     output: Annotated[
         Path | None,
         options.output(
-            "OUT.png or OUT.exr; both are written.", ".png", ".exr", show_default="out/SUBJECT.png"
+            "NAME.png or NAME.exr; both are written.", ".png", ".exr", show_default="out/SUBJECT.png"
         ),
     ] = None,
-    model: Annotated[str, typer.Option(help="nma, the adapter, or layered, the reference.")] = "nma",
+    model: Annotated[str, typer.Option(help="nma: the adapter. layered: the reference.")] = "nma",
     adapter: options.AdapterName = "layered3-5x64",
     clamp: options.Clamp = False,
     changes: options.Changes = None,
@@ -39,7 +39,9 @@ def render(
     envmap: options.Envmap = None,
     mesh: Annotated[
         Path | None,
-        typer.Option(help="Show this mesh (PLY or OBJ) in place of the ball, on the floor and as large."),
+        typer.Option(
+            help="Show this mesh (PLY or OBJ) in place of the ball, scaled to its size and put on the floor."
+        ),
     ] = None,
     mesh_up: Annotated[str, typer.Option(help="The axis of the mesh that points up: z or y.")] = "z",
     size: Annotated[
@@ -67,15 +69,15 @@ def render(
             "--define",
             "-D",
             metavar="NAME=VALUE",
-            help="A parameter ($NAME) of the XML scene. May be repeated.",
+            help="Set a parameter ($NAME) of the XML scene. May be repeated.",
         ),
     ] = None,
     variant: options.MitsubaVariant = "auto",
 ) -> None:
     """Render a material in the preview scene, or a Mitsuba scene as it is, to EXR and PNG.
 
-    Scenes may use the BSDFs `nma` and `layered`, which the `mitsuba` program cannot see. They bring their own material,
-    camera, light and path depth, so options for those apply to materials alone.
+    Scenes may use the BSDFs `nma` and `layered`, which the program `mitsuba` does not know. A scene brings its own
+    materials, camera, lights and path depth, so the options for those are for materials alone.
 
     Examples: [bold]nma render gold-red-lacquer --camera close --set alpha_top=.05[/bold],
     [bold]nma render my-material.toml --model layered -o out/my.exr[/bold], [bold]nma render scene.xml --spp 256[/bold]
@@ -101,7 +103,7 @@ def render(
 def _load_file(
     path: str, define: list[str] | None, size: tuple[int, int] | None, variant: str
 ) -> tuple[Any, int]:
-    """A scene from an XML file, and its samples per pixel."""
+    """A scene from an XML file, and the samples per pixel that it asks for."""
     import nma.render
     from nma.render.load import load_scene
 
@@ -117,7 +119,7 @@ def _clamped(scene: Any, limit: float) -> Any:
 
 
 def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float) -> None:
-    """All channels as EXR, the colours as PNG."""
+    """Writes all channels as EXR and the colours as PNG."""
     from nma.images.io import write_exr, write_png
     from nma.render.channels import channel_names, colours
 
@@ -128,5 +130,5 @@ def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float)
 
 
 def _outputs(path: Path) -> tuple[Path, Path]:
-    """The EXR and the PNG that belong to an output file's name."""
+    """The EXR and the PNG to write: both names differ from `path` by their endings alone."""
     return path.with_suffix(".exr"), path.with_suffix(".png")

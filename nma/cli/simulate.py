@@ -27,12 +27,13 @@ def register(app: typer.Typer) -> None:
 def simulate(
     output: Annotated[Path, options.output("The reference file to write.", ".npz")],
     params: Annotated[
-        Path | None, typer.Option(help="A file (.npz) with `params` (n, 13), a reference file for example.")
+        Path | None,
+        typer.Option(help="A file (.npz) with an array `params` (n, 13); reference files have one."),
     ] = None,
     material: Annotated[
         list[str] | None, typer.Option(help="A named material or material file; may be repeated.")
     ] = None,
-    draw: Annotated[int, options.number("Draw this many materials at random instead.", 0, 100_000)] = 0,
+    draw: Annotated[int, options.number("Draw this many materials at random.", 0, 100_000)] = 0,
     population: Annotated[
         str, options.choice("Where drawn conductors come from.", *options.POPULATIONS)
     ] = "mixed",
@@ -52,7 +53,7 @@ def simulate(
     from nma.table import Tables, kept, stream_keys, tabulate
 
     files.try_file(output)
-    # Finished materials wait beside the output, so that a killed run goes on where it stopped.
+    # Finished materials are kept beside the output, so that a killed run goes on where it stopped.
     parts = output.with_name(output.name + ".parts")
     files.try_folder(parts)
     source = sources.get(_class_of(material) if material else class_name)
@@ -88,7 +89,7 @@ def _class_of(names: list[str]) -> str:
 
 
 def _vectors(space, params, material, draw, population, seed):
-    """The parameter vectors that `simulate` was asked for, from exactly one of its three sources."""
+    """The parameter vectors to simulate. The user names them in exactly one of three ways."""
     import numpy as np
 
     if (params is not None) + bool(material) + bool(draw) != 1:
@@ -97,9 +98,9 @@ def _vectors(space, params, material, draw, population, seed):
         try:
             with files.arrays(params) as f:
                 vectors = np.asarray(f["params"], np.float64)
-        except Exception as e:  # zipfile raises a kind of its own for damaged archives
+        except Exception as e:  # zipfile has an exception of its own for damaged archives
             raise TableError(
-                f"{params}: no .npz file with an array `params` (n, {space.size}): {e}"
+                f"{params}: this is no .npz file with an array `params` (n, {space.size}): {e}"
             ) from None
         return space.check(vectors)
     if material:

@@ -23,21 +23,21 @@ def train(
     stream: Annotated[
         int,
         options.number(
-            "Without a dataset: keep this many fresh materials in memory, replaced as training goes on.",
+            "Without a dataset: simulate this many materials, keep them in memory, and replace them all the time.",
             0,
             100_000,
         ),
     ] = 0,
     walks: Annotated[int, options.walks("Walks per streamed material.")] = 819_200,
     refresh: Annotated[
-        int, options.number("Steps between two exchanges of streamed materials.", 1, 10**9)
+        int, options.number("Steps from one replacement of streamed materials to the next.", 1, 10**9)
     ] = 400,
     preset: Annotated[
-        str, options.choice("Our recipe for classes, or the paper's.", "class", "paper")
+        str, options.choice("class: our recipe for classes. paper: the paper's recipe.", "class", "paper")
     ] = "class",
     variant: options.Variant = "blended+omega_i",
     instances: Annotated[
-        int | None, options.number("Principled instances in the blend, instead of the variant's.", 1, 5)
+        int | None, options.number("How many Principled instances to blend, whatever the variant says.", 1, 5)
     ] = None,
     network: options.Network = None,
     target: options.Target = None,
@@ -50,7 +50,7 @@ def train(
     learning_rate: options.Rate = None,
     seed: options.TrainingSeed = 0,
 ) -> None:
-    """Train an adapter for a whole class. A killed run goes on from its checkpoint (OUTPUT.ckpt).
+    """Train an adapter for a whole class. If killed, run it again: it goes on from its checkpoint (OUTPUT.ckpt).
 
     Example: [bold]nma dataset layered3 l3.zarr && nma train layered3 --data l3.zarr -o my.safetensors[/bold]
     """
@@ -86,7 +86,7 @@ def train(
 
 
 def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
-    """(tables of a dataset, or the settings of a stream; record of their origin)."""
+    """What to train on, and the record of its origin: tables of a dataset, or settings for a stream of materials."""
     from nma.table.dataset import Dataset, Settings
 
     if (data is None) == (stream == 0):

@@ -7,7 +7,7 @@ from typing import Any
 
 from nma.cli import console, options
 
-# The loss that is printed is the mean over so many steps, the last ones.
+# The printed loss is the mean over this many steps, the last ones.
 _LAST = 500
 
 
