@@ -244,7 +244,7 @@ def test_a_merl_file_is_a_collection_of_one(tmp_path):
 def test_collections_without_sense_are_refused(folder, tmp_path):
     with pytest.raises(SourceError, match="no such folder or file; `nma data`"):
         collection.members(tmp_path / "nowhere")
-    with pytest.raises(SourceError, match="holds no material; their files end in .binary"):
+    with pytest.raises(SourceError, match="holds no material; files of materials end in .binary"):
         collection.members(tmp_path)
     xml(tmp_path / "a.xml", COLOURS[0])
     (tmp_path / "a.bsdf").write_bytes(b"")

@@ -165,7 +165,7 @@ def test_a_black_source_has_no_noise():
 
 def test_what_cannot_be_tabulated_is_refused():
     brushed = Formula(lopsided, isotropic=False, name="brushed")
-    with pytest.raises(TableError, match="brushed is anisotropic, the grid is not"):
+    with pytest.raises(TableError, match="brushed is anisotropic, but the grid is isotropic"):
         tabulate_values(brushed)
     for points in (0, 2, 20):
         with pytest.raises(TableError, match=f"{points} point.* multiple of 16"):

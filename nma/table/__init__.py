@@ -1,4 +1,4 @@
-"""BSDF tables: their grid and files, and what makes them, from walks or from known values."""
+"""BSDF tables: their grid, their files, and how they are made from random walks or from sources with known values."""
 
 from nma.table.grid import ANISOTROPIC, ISOTROPIC, Grid, Tables, kept
 from nma.table.walks import stream_keys, tabulate

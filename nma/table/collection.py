@@ -1,4 +1,4 @@
-"""Collections of materials, a folder of files or a file that holds many, and their tables."""
+"""Collections of materials and their tables. A collection is a folder of files, or one file with many materials."""
 
 from __future__ import annotations
 
@@ -18,40 +18,38 @@ from nma.sources.base import Values
 from nma.table.grid import Tables, kept
 from nma.table.values import tabulate_values
 
-# What is in the name of a table beside the material's, so that a table of another file is not taken for its own.
+# Digits of the material file's SHA-256 in the name of its table's file, so that a table is never used for another file.
 _DIGEST = 12
 
 
 @dataclass(frozen=True)
 class Member:
-    """One material of a collection; `material` chooses in a file that holds several."""
+    """One material of a collection. If its file holds several materials, `material` says which one it is."""
 
     name: str
     path: Path
     material: str | None = None
 
     def read(self) -> Values:
-        """Its values; raises `SourceError`."""
+        """The material as a source. Raises `SourceError` if the file cannot be read."""
         return sources.read(self.path, self.material)
 
 
 def members(path: str | Path) -> list[Member]:
-    """The materials of a folder's files, or of one file, in the order of their names.
+    """The materials of one file, or of all files in a folder, in the order of the files' names.
 
-    Files are those that `nma.sources.read` knows by the end of their name; each of the networks in an NBRDF weights
-    file is one. What lies in folders further down is not looked at. Raises `SourceError` where there is no material, or
-    where two have the same name.
+    Files are chosen by their extension, which must be one that `nma.sources.read` understands. In an NBRDF weights file
+    each network is a material. Subfolders are not searched. Raises `SourceError` if there is no material, or if two
+    have the same name.
     """
     path = Path(path)
     if not path.exists():
-        raise SourceError(
-            f"{path}: no such folder or file; `nma data` says where measured materials come from"
-        )
+        raise SourceError(f"{path}: no such folder or file; `nma data` says where to get measured materials")
     endings = sources.endings()
     files = sorted(f for f in path.iterdir() if f.is_file()) if path.is_dir() else [path]
     found = [member for file in files if file.suffix in endings for member in _of_file(file)]
     if not found:
-        raise SourceError(f"{path}: holds no material; their files end in {', '.join(endings)}")
+        raise SourceError(f"{path}: holds no material; files of materials end in {', '.join(endings)}")
     name, count = Counter(member.name for member in found).most_common(1)[0]
     if count > 1:
         raise SourceError(f"{path}: {count} materials are called '{name}'; rename or remove one of the files")
@@ -65,7 +63,7 @@ def _of_file(file: Path) -> list[Member]:
 
 
 def origin(chosen: Sequence[Member]) -> str:
-    """What the materials are, for texts and records: NBRDF-MERL, or the kinds of their files."""
+    """The origin of the materials, for messages and records: a name such as NBRDF-MERL, or their files' extensions."""
     if all(member.material for member in chosen):
         return nbrdf.kind([member.name for member in chosen])
     return ", ".join(sorted({f"*{member.path.suffix}" for member in chosen}))
@@ -74,10 +72,11 @@ def origin(chosen: Sequence[Member]) -> str:
 def tables(
     chosen: Sequence[Member], folder: str | Path, progress: Callable[[int], None] = lambda done: None
 ) -> Tables:
-    """The tables of some materials, each kept in `folder` once it is made, so that a killed run goes on there.
+    """The tables of the materials `chosen`, in that order.
 
-    A table belongs to the content of its file: another file of the same name is tabulated anew. `params` are the
-    materials' numbers, (n, 1). Raises `SourceError` and `TableError` for what cannot be read or is anisotropic.
+    Each table is saved in `folder` once it is made, so that a killed run can go on. It is used again only for a file of
+    the same content, not for another file of the same name. `params` (n, 1) of the tables are the materials' positions
+    in `chosen`. Raises `SourceError` if a file cannot be read, and `TableError` if a material is anisotropic.
     """
     digests: dict[Path, str] = {}
     made = []

@@ -1,8 +1,9 @@
-"""A class sampled into many tables on disk: one zarr chunk per material, resumable, written by any number of workers.
+"""Datasets: tables of many random materials of a class, stored on disk as one zarr chunk per material.
 
-A chunk is written to a temporary file and renamed (by zarr 3.1.3 or later), so it exists only when it is whole; the
-material and its random stream depend on (seed, index) alone. Hence a killed run goes on where it stopped, and workers
-need no coordination: should two of them simulate one material, they write the same bytes.
+Any number of workers may write a dataset, and a killed run goes on where it stopped. zarr (3.1.3 or later) writes a
+chunk to a temporary file and renames it, so a chunk that exists is complete. A material and its random stream depend
+only on (seed, index). So workers need no coordination: if two of them simulate the same material, they write the same
+bytes.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ from nma.table.grid import ISOTROPIC, Tables
 from nma.table.walks import stream_keys, tabulate
 
 FORMAT = 1
-# Materials simulated at once, and walks that are lost at most when a run is killed; no influence on the result.
+# The number of materials that are simulated at once. `_BLOCK_WALKS` limits it further, so that a killed run loses that
+# many walks at most. Neither changes the result.
 _BLOCK = 16
 _BLOCK_WALKS = 1 << 27
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What determines every number of a dataset: `walks` per material, the rest as `nma dataset --help` has it.
+    """The settings that determine every number of a dataset. `walks` counts per material.
 
-    Raises `DatasetError` for settings that make no dataset.
+    `nma dataset --help` explains the other settings. Raises `DatasetError` if a setting is out of range.
     """
 
     class_name: str
@@ -55,25 +57,25 @@ class Settings:
             )
         if self.population not in get_args(Population) or self.population == "unseen_metals":
             known = ", ".join(p for p in get_args(Population) if p != "unseen_metals")
-            # Each material is drawn on its own, so nothing can depend on its place among the others.
+            # Materials are drawn one by one, and "unseen_metals" chooses by the position among all that are drawn.
             raise DatasetError(f"a dataset's population is one of {known}; got '{self.population}'")
 
 
 def draw_params(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.float64]:
-    """Parameter vectors of the materials `indices`, each from its own stream."""
+    """Parameter vectors (n, columns) of the materials `indices`, each drawn from the material's own random stream."""
     space = sources.get(settings.class_name).space
     rows = [np.random.default_rng((settings.seed, int(i), 0x9A7A)) for i in indices]
     return np.concatenate([space.sample(rng, 1, settings.population) for rng in rows])
 
 
 def _fingerprint(settings: Settings) -> str:
-    """Changes when another version of the package draws other parameters from the same seed."""
+    """A digest of drawn parameters. It differs if a version of the package draws other parameters from the seed."""
     ends = draw_params(settings, [0, settings.materials - 1]).astype(np.float32)
     return hashlib.sha256(ends.tobytes()).hexdigest()[:16]
 
 
 def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> Tables:
-    """Parameters and tables, without errors, of the materials `indices`."""
+    """The tables of the materials `indices`, without standard errors."""
     source = sources.get(settings.class_name)
     return tabulate(
         source,
@@ -85,14 +87,17 @@ def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[i
 
 
 class Dataset:
-    """A dataset on disk. `Dataset.create` or `Dataset.open`, then `write` to complete it, `load` to use it."""
+    """A dataset on disk. `create` and `open` return one, `write` completes it, and `load` reads its tables."""
 
     def __init__(self, path: Path, settings: Settings, table: zarr.Array):
         self.path, self.settings, self._table = path, settings, table
 
     @staticmethod
     def create(path: str | Path, settings: Settings) -> Dataset:
-        """Opens the dataset at `path` if it was made with the same settings, or creates it. Raises `DatasetError`."""
+        """Opens the dataset at `path`, or creates it if there is none.
+
+        Raises `DatasetError` if the dataset was made with other settings.
+        """
         path = Path(path)
         if not os.path.exists(path / "zarr.json"):
             _create_array(path, settings)
@@ -109,10 +114,10 @@ class Dataset:
 
     @staticmethod
     def open(path: str | Path) -> Dataset:
-        """The dataset at `path`; `DatasetError` if there is none."""
+        """Opens the dataset at `path`. Raises `DatasetError` if there is none, or if it needs to be made again."""
         path = Path(path)
         try:
-            # A chunk of zeros is stored like any other: its file says that the material is done.
+            # Chunks of zeros are stored, too, because a chunk's file marks its material as done.
             table = zarr.open_array(path, mode="r+", config={"write_empty_chunks": True})
             settings = Settings(**dict(table.attrs["nma_dataset"]))  # type: ignore[arg-type]
             fingerprint = table.attrs["nma_params"]
@@ -139,15 +144,18 @@ class Dataset:
         return os.path.exists(self._chunk(index))
 
     def missing(self) -> NDArray[np.int64]:
-        """Indices of the materials that are not on disk yet."""
+        """Indices of the materials whose tables are not on disk yet."""
         return np.array([i for i in range(self.settings.materials) if not self._has(i)], np.int64)
 
     def write(self, progress: Callable[[int], None] = lambda done: None) -> None:
-        """Simulates and stores what is missing, calling `progress` with the number of materials done, by anybody."""
+        """Simulates and stores the missing materials.
+
+        Calls `progress` with the number of materials on disk, which includes those that other workers have written.
+        """
         size = max(1, min(_BLOCK, _BLOCK_WALKS // self.settings.walks))
         blocks = np.array_split(np.arange(self.settings.materials), -(-self.settings.materials // size))
         left = self.missing()
-        # Each worker takes the blocks in an order of its own, so that several of them seldom meet.
+        # Each worker takes the blocks in its own random order, so that two workers seldom simulate the same block.
         for b in np.random.default_rng(os.getpid()).permutation(len(blocks)):
             todo = [int(i) for i in blocks[b] if not self._has(i)]
             if todo:
@@ -165,7 +173,10 @@ class Dataset:
             ) from None
 
     def load(self, indices: NDArray[np.integer] | range | None = None) -> Tables:
-        """The tables (float16) of `indices`, or of all materials. A missing or damaged chunk raises `DatasetError`."""
+        """The tables (float16) of the materials `indices`, or of all materials.
+
+        Raises `DatasetError` if a chunk is missing or damaged.
+        """
         indices = np.arange(self.settings.materials) if indices is None else np.asarray(indices)
         values = np.empty((len(indices), *ISOTROPIC.shape), np.float16)
         for row, i in enumerate(indices):
@@ -191,7 +202,7 @@ class Dataset:
 
 
 def _create_array(path: Path, settings: Settings) -> None:
-    """An empty dataset at `path`, unless another worker is faster."""
+    """Creates an empty dataset at `path`, unless another worker has just created it."""
     try:
         with suppress(ContainsArrayError):
             zarr.create_array(

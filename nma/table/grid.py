@@ -1,9 +1,9 @@
-"""BSDF tables with bins uniform in solid angle: their grid, and tables as files.
+"""BSDF tables whose bins have equal solid angles: their grid and their files.
 
-Isotropic tables have shape (n, theta_i, theta_o, phi, 3): bins uniform in cos(theta_i) and cos(theta_o), index 0 at
-grazing, and in the azimuth between wi and wo folded to [0, pi], mirror direction last. Anisotropic ones have shape
-(n, theta_i, phi_i, theta_o, phi_o, 3) with azimuths over [0, 2 pi). A value is the mean of f cos(theta_o) over its
-bin [1/sr].
+Isotropic tables have shape (n, theta_i, theta_o, phi, 3). Their bins are uniform in cos(theta_i) and cos(theta_o), with
+index 0 at grazing, and in the azimuth between wi and wo. The azimuth is folded to [0, pi], with the mirror direction in
+the last bin. Anisotropic tables have shape (n, theta_i, phi_i, theta_o, phi_o, 3), with azimuths over [0, 2 pi). A
+value is the mean of f cos(theta_o) over its bin [1/sr].
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from nma.files import arrays, whole
 
 @dataclass(frozen=True)
 class Grid:
-    """Resolution of a table. `phi_i == 0` means isotropic and folded."""
+    """The number of bins of a table in each dimension. `phi_i == 0` means an isotropic, folded table."""
 
     theta_i: int = 40
     theta_o: int = 40
@@ -33,13 +33,13 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of one material's table, RGB last."""
+        """The shape of one material's table; the last dimension is RGB."""
         rows = (self.theta_i, self.phi_i) if self.phi_i else (self.theta_i,)
         return (*rows, self.theta_o, self.phi_o, 3)
 
     @property
     def rows(self) -> int:
-        """Number of bins of wi."""
+        """The number of bins of wi."""
         return self.theta_i * max(self.phi_i, 1)
 
     @property
@@ -48,11 +48,11 @@ class Grid:
 
     @property
     def solid_angle(self) -> float:
-        """Solid angle of a bin of wo [sr]; a folded bin counts both of its mirror halves."""
+        """The solid angle of a bin of wo [sr]. A folded bin has two mirror halves, and both count."""
         return 2.0 * math.pi / (self.theta_o * self.phi_o)
 
     def walks(self, wanted: int) -> int:
-        """`wanted` rounded up to the same number of walks in every row."""
+        """`wanted`, rounded up to a multiple of `rows`, so that every row gets the same number of walks."""
         return -(-wanted // self.rows) * self.rows
 
 
@@ -62,7 +62,11 @@ ANISOTROPIC = Grid(phi_o=80, phi_i=80)
 
 @dataclass
 class Tables:
-    """Tables of n materials, float32 `values` (n, *grid.shape), their standard `error` or None, and `walks` of each."""
+    """The tables of n materials.
+
+    `params` (n, columns) are the materials' parameters, `values` (n, *grid.shape) their tables. `walks` (n,) are the
+    numbers of random walks. `error` has the standard error of each value, or is None.
+    """
 
     params: NDArray[np.float64]
     values: NDArray[np.floating]
@@ -71,22 +75,22 @@ class Tables:
 
     @property
     def grid(self) -> Grid:
-        """The resolution, from the shape of `values`."""
+        """The grid that the shape of `values` implies."""
         theta_i, *phi_i, theta_o, phi_o, _ = self.values.shape[1:]
         return Grid(theta_i, theta_o, phi_o, *phi_i)
 
     def albedo(self) -> NDArray[np.float64]:
-        """Directional albedo (n, theta_i[, phi_i], 3): 2 pi times the mean over the bins of wo."""
+        """Directional albedo (n, theta_i[, phi_i], 3): 2 pi times the mean value over the bins of wo."""
         return 2.0 * math.pi * self.values.mean(axis=(-3, -2), dtype=np.float64)
 
     def __getitem__(self, chosen: slice | NDArray) -> Tables:
-        """The tables of some materials, by a slice or by their numbers."""
+        """The tables of the materials that a slice, or an array of indices, chooses."""
         error = None if self.error is None else self.error[chosen]
         return Tables(self.params[chosen], self.values[chosen], self.walks[chosen], error)
 
     @staticmethod
     def concatenate(parts: Sequence[Tables]) -> Tables:
-        """One after the other; all of them with errors, or none."""
+        """Joins tables of several materials. Raises `TableError` if only some of them have standard errors."""
         errors = [t.error for t in parts if t.error is not None]
         if errors and len(errors) < len(parts):
             raise TableError("some of the tables have standard errors, others have none")
@@ -98,7 +102,7 @@ class Tables:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes the reference-file format of CONVENTIONS.md, atomically."""
+        """Writes a reference file (its format is in CONVENTIONS.md), atomically."""
         arrays: dict[str, Any] = {"params": self.params, "table": self.values, "walks": self.walks}
         if self.error is not None:
             arrays["error"] = self.error
@@ -107,7 +111,7 @@ class Tables:
 
     @staticmethod
     def load(path: str | Path) -> Tables:
-        """Reads a reference file; `TableError` says what is wrong with it."""
+        """Reads a reference file. Raises `TableError` with the fault if the file is missing or damaged."""
         path = Path(path)
         try:
             with arrays(path) as f:
@@ -119,7 +123,7 @@ class Tables:
             raise TableError(
                 f"{path}: not a reference file (.npz with params, table and walks): {e}"
             ) from None
-        except Exception as e:  # zipfile and zlib raise their own kinds for damaged archives
+        except Exception as e:  # zipfile and zlib raise their own exceptions for damaged archives
             raise TableError(f"{path}: damaged archive: {e}") from None
         _check_arrays(path, params, values, walks, error)
         walks = np.broadcast_to(walks, len(params)).astype(np.int64)
@@ -127,9 +131,9 @@ class Tables:
 
 
 def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | None = None) -> Tables:
-    """The tables that an earlier run left in a file, or those of `make`, which are left there for a later one.
+    """Loads the tables from the file `path`, or makes them with `make` and saves them there for the next run.
 
-    A damaged file is made anew, and so is one of other `params`, if those are given.
+    The tables are made again if the file is damaged, or if `params` are given and differ from those of the file.
     """
     with suppress(TableError):
         found = Tables.load(path)
@@ -139,7 +143,7 @@ def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | N
     try:
         made.save(path)
     except OutputError:
-        # Another run for the same output may have ended and taken the folder away.
+        # Another run for the same output may have ended and deleted the folder. `save` makes it again.
         made.save(path)
     return made
 
@@ -147,7 +151,7 @@ def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | N
 def _check_arrays(
     path: Path, params: NDArray, values: NDArray, walks: NDArray, error: NDArray | None
 ) -> None:
-    """Refuses arrays that are no reference file, naming the first fault."""
+    """Raises `TableError` with the first fault if the arrays are not those of a reference file."""
     n = len(params) if params.ndim else 0
     arrays = {"params": params, "table": values, "walks": walks} | ({} if error is None else {"error": error})
     for name, array in arrays.items():

@@ -1,7 +1,7 @@
-"""From sources that know their value to tables, and back.
+"""Tables of sources that can be evaluated (`Values`), and tables used as such sources.
 
-The value of a bin is the mean of f cos(theta_o) over it, from fixed points in it. A table is itself a source, one that
-knows a value for each bin.
+The value of a bin is the mean of f cos(theta_o) over fixed points in the bin. A table, too, can be evaluated: every
+pair of directions has the value of its bin.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from nma.sources.lookup import Lookup
 from nma.table import quadrature
 from nma.table.grid import ISOTROPIC, Grid, Tables
 
-# Points of a bin, unless asked for otherwise. Bins around the mirror direction get so many times more, crowded towards
-# it: there are few of them, and they hold the peaks of smooth materials.
+# The default number of points per bin. Bins near the mirror direction get `_NEAR` times more points, which are denser
+# towards it. There are few such bins, and they hold the peaks of smooth materials.
 POINTS = 128
 _NEAR = 32
-# How many bins away from the mirror direction's elevation that is.
+# A bin is near if its elevation is within this many bins of the mirror direction's.
 _REACH = 4.5
 
-# Independent sets that a bin's points are divided into; their spread is its standard error.
+# A bin's points are divided into this many independent sets. The spread of the sets' means gives the standard error.
 _SETS = 4
-# Points come in so many: as many of them in each set, and within a set pairs in both mirror halves.
+# The number of points is a multiple of this, so that the sets are equal and each has whole pairs in both mirror halves.
 _MULTIPLE = 16
-# Points keep this share of a bin's width off its edges, where rounding might move them into the next.
+# Points stay this fraction of a bin's width away from its edges, so that rounding moves none into the next bin.
 _EDGE = 1e-5
 
-# Weights whose variance is below do not differ but by rounding.
+# Weights with a smaller variance count as equal: only rounding makes them differ.
 _UNWEIGHTED = 1e-4
 
-# Bins of one launch: bounds the memory, has no influence on the result.
+# The most bins in one kernel launch. It limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 20
 
-# The number of walks of a table without any noise.
+# The number of walks that a table without any noise reports.
 _NOISELESS = 1 << 40
 
 
 def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POINTS) -> Tables:
-    """The table of one source, whose parameters are an empty vector, (1, 0).
+    """The table of one source. Its `params` have the shape (1, 0).
 
-    `points` per bin, a multiple of 16, are spread evenly over it; around the mirror direction there are 32 times
-    more, crowded down to the narrowest lobe. Equal arguments give equal tables. `error` is the standard error that
-    four independent sets of points show, rounding aside; it knows nothing of the source's own faults, such as the
-    noise of a measurement. `walks` says how many random walks would leave the median bin with the same error, at most
-    2^40.
+    A bin's value is the mean over `points` points (a multiple of 16), evenly spread in the bin. Near the mirror
+    direction there are 32 times more points, which get denser down to the narrowest lobe. Equal arguments give equal
+    tables. `error` is the standard error, estimated from four independent sets of points. It does not include rounding
+    or errors of the source itself, such as the noise of a measurement. `walks` is the number of random walks that would
+    give the median bin the same error, at most 2^40.
 
-    Raises `TableError` for an anisotropic source on an isotropic grid, another number of points, and values that are
-    not finite.
+    Raises `TableError` for an anisotropic source on an isotropic grid, for a wrong number of points, and for values
+    that are not finite.
     """
     if not (values.isotropic or grid.phi_i):
         raise TableError(
-            f"{values.name} is anisotropic, the grid is not; give one with azimuths of wi, such as "
+            f"{values.name} is anisotropic, but the grid is isotropic; use a grid with azimuths of wi, such as "
             "nma.table.ANISOTROPIC"
         )
     if points < 1 or points % _MULTIPLE:
@@ -78,10 +78,10 @@ def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POI
 
 
 def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
-    """Which bins lie close to the mirror direction of some wi of theirs."""
+    """Which bins are close to the mirror direction of a wi in the bin."""
     i, a, o, b = _indices(bins, grid)
     near_o = _apart(i, grid.theta_i, o, grid.theta_o) < _REACH
-    # Where both directions are close to the normal, half vectors are so at every azimuth.
+    # If both directions are close to the normal, so is the half vector, whatever the azimuths are.
     top = (i == grid.theta_i - 1) & (o == grid.theta_o - 1)
     if not grid.phi_i:
         return near_o & (b >= grid.phi_o - 2) | top
@@ -89,7 +89,10 @@ def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _apart(a: NDArray, n: int, b: NDArray, m: int, periodic: bool = False) -> NDArray[np.float64]:
-    """How far apart the middles of bins `a` of `n` and `b` of `m` of one interval lie, in mean widths of a bin."""
+    """Distance between the middle of bin `a` of `n` and that of bin `b` of `m`, in mean bin widths.
+
+    Both grids divide the same interval.
+    """
     distance = (a + 0.5) / n - (b + 0.5) / m
     if periodic:
         distance = distance - np.round(distance)
@@ -97,7 +100,10 @@ def _apart(a: NDArray, n: int, b: NDArray, m: int, periodic: bool = False) -> ND
 
 
 def _indices(bins: Any, grid: Grid) -> tuple[Any, Any, Any, Any]:
-    """(theta_i, phi_i, theta_o, phi_o) of flattened bins, on NumPy or Dr.Jit; phi_i is 0 in isotropic grids."""
+    """The indices (theta_i, phi_i, theta_o, phi_o) of flattened bins, in NumPy or Dr.Jit.
+
+    In isotropic grids phi_i is 0.
+    """
     b, rest = bins % grid.phi_o, bins // grid.phi_o
     o, row = rest % grid.theta_o, rest // grid.theta_o
     azimuths = max(grid.phi_i, 1)
@@ -107,7 +113,7 @@ def _indices(bins: Any, grid: Grid) -> tuple[Any, Any, Any, Any]:
 def _means(
     values: Values, bins: NDArray, count: int, crowded: bool, grid: Grid
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and standard error (bins, 3) from `_SETS` sets of `count` points each."""
+    """Means and standard errors, each (bins, 3), from `_SETS` sets of `count` points per bin."""
     sets = np.stack([_moments(values, bins, count, crowded, grid, number) for number in range(_SETS)])
     finite = np.isfinite(sets).all(axis=(0, 2))
     if not finite.all():
@@ -115,8 +121,8 @@ def _means(
         place = (i, a, o, b) if grid.phi_i else (i, o, b)
         raise TableError(f"{values.name}: has values that are not finite, first in bin {place}")
     weight, square, value, product = sets[..., :1], sets[..., 1:2], sets[..., 2:5], sets[..., 5:]
-    # The mean weight is known to be 1: take off what its deviation explains (a control variate). That makes the mean of
-    # what hardly changes within a bin almost exact, whatever the weights.
+    # The weights are a control variate: their mean is known to be 1. Subtract the part of the mean that the deviation
+    # from 1 explains. Where values hardly change within a bin, their mean becomes almost exact, whatever the weights.
     variance = np.mean(square - weight * weight, axis=0)
     covariance = np.mean(product - weight * value, axis=0)
     slope = np.where(variance > _UNWEIGHTED, covariance / np.maximum(variance, _UNWEIGHTED), 0.0)
@@ -128,10 +134,10 @@ def _means(
 def _moments(
     values: Values, bins: NDArray, count: int, crowded: bool, grid: Grid, number: int
 ) -> NDArray[np.float64]:
-    """Means (bins, 8) over one set of points of w, w^2, w f and w^2 f, w the weight and f the value in RGB.
+    """The means (bins, 8) of w, w^2, w f and w^2 f over one set of points; w is the weight and f the RGB value.
 
-    The points are a lattice, shifted at random for each bin, and their images under u -> 1 - u, which make the means of
-    linear functions exact.
+    The points are those of a lattice, shifted at random for each bin, and their mirror images u -> 1 - u. The mirror
+    images make the means of linear functions exact.
     """
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     flat = UInt32(bins.astype(np.uint32))
@@ -146,7 +152,7 @@ def _moments(
         u = [dr.select((k & 1) == 0, x, 1.0 - x) * (1.0 - 2.0 * _EDGE) + _EDGE for x in u]
         wi, wo, w = quadrature.points(place, u, grid, quadrature.FINEST if crowded else None)
         if not grid.phi_i:
-            # A folded bin is both of its mirror halves: every other pair of points goes to the other one.
+            # A folded bin consists of two mirror halves. Every second pair of points goes to the second half.
             wo = Vec3(wo.x, dr.select((k & 2) == 0, wo.y, -wo.y), wo.z)
         value = values.eval(wi, wo) * w
         return k + 1, [s + x for s, x in zip(sums, (w, w * w, *value, *(value * w)), strict=True)]
@@ -158,7 +164,7 @@ def _moments(
 
 
 def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:
-    """How many walks leave a bin's error as small as it is, for the median of all bins."""
+    """The number of walks that would give a bin its error: the median over all bins."""
     noisy = (mean > 0) & (error > 0)
     if not noisy.any():
         return _NOISELESS
@@ -172,12 +178,12 @@ def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:
 class TableValues:
     """A table as a source (`Values`): every pair of directions has the value of its bin.
 
-    Tabulated again it gives the same table. `smooth` interpolates between the middles of bins instead, which shows no
-    steps in pictures, but widens peaks and changes the means.
+    `tabulate_values` of this source gives the same table again. With `smooth`, values are interpolated linearly between
+    the middles of the bins. This avoids steps in pictures, but it widens peaks and changes the means.
     """
 
     def __init__(self, tables: Tables, number: int = 0, *, name: str = "table", smooth: bool = False):
-        """The `number`-th material of `tables`. Raises `TableError` where there is none."""
+        """Takes material `number` of `tables`, counted from 0. Raises `TableError` if there is no such material."""
         if not 0 <= number < len(tables.values):
             raise TableError(f"{name}: no material {number} among its {len(tables.values)}")
         table = tables.values[number]
@@ -195,13 +201,13 @@ class TableValues:
 
     @staticmethod
     def _isotropic(wi: Vec3, wo: Vec3) -> list[Float]:
-        """Position in a folded table, 0 .. 1 in each dimension."""
+        """The position in a folded table, 0 .. 1 in each dimension."""
         azimuth = ops.atan2(wi.x * wo.y - wi.y * wo.x, wi.x * wo.x + wi.y * wo.y)
         return [wi.z, wo.z, ops.absolute(azimuth) * ops.INV_PI]
 
     @staticmethod
     def _anisotropic(wi: Vec3, wo: Vec3) -> list[Float]:
-        """Position in a table of all four angles, 0 .. 1 in each dimension."""
+        """The position in an anisotropic table, 0 .. 1 in each dimension."""
         turns = [ops.atan2(w.y, w.x) * (0.5 * ops.INV_PI) for w in (wi, wo)]
         turns = [ops.select(t < 0, t + 1.0, t) for t in turns]
         return [wi.z, turns[0], wo.z, turns[1]]

@@ -1,4 +1,4 @@
-"""Tables from random walks (paper eq. 9): walks start in every bin of wi and are counted where they end."""
+"""Tables from random walks (paper eq. 9): walks start in every bin of wi and are counted in the bin where they end."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from nma.ops import Vec3
 from nma.sources.base import Source, Walk
 from nma.table.grid import ISOTROPIC, Grid, Tables
 
-# Throughputs are counted as integers in units of 2^-16: integer sums do not depend on the order of the additions.
+# Throughputs are summed as integers in units of 2^-16, because an integer sum does not depend on the order of addition.
 _UNIT = 65536.0
-# So many walks of one row fit one 32-bit bin, all of them with throughput 1, and leave room for some above 1.
+# A 32-bit bin can count this many walks of throughput 1, with room for some throughputs above 1.
 _WALKS_PER_ROW = 49151
-# Bins that one launch counts in, over all of its materials: bounds the memory, has no influence on the result.
+# The most bins in one kernel launch, over all of its materials. It limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 21
 
 
@@ -34,11 +34,12 @@ def tabulate(
     grid: Grid = ISOTROPIC,
     error: bool = True,
 ) -> Tables:
-    """Tables of `params` (n, columns) from at least `walks` walks each.
+    """The tables of n materials, each from at least `walks` random walks.
 
-    `keys` (n,), from `stream_keys`, seed the materials' random streams: equal key, equal table, whatever else is in the
-    call. Without `error` no standard errors are counted, which takes half of the memory. Raises `ParamError` for
-    parameters that are not physically valid.
+    `params` (n, columns) are the materials' parameters. `keys` (n,), made by `stream_keys`, seed their random streams:
+    a material with the same key gets the same table, whichever other materials are in the call. If `error` is false,
+    the tables have no standard errors, which halves the memory. Raises `ParamError` if parameters are not physically
+    valid.
     """
     params = source.space.check(params)
     if walks < 1 or len(keys) != len(params):
@@ -63,7 +64,7 @@ def tabulate(
 
 
 def stream_keys(seed: int, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.uint64]:
-    """Random-stream keys of materials: each depends on the seed and the material's own index alone."""
+    """The keys (n,) of the random streams of materials. A key depends only on `seed` and on the material's index."""
     return np.array(
         [np.random.SeedSequence((seed, int(i), 0x77A1)).generate_state(1, np.uint64)[0] for i in indices]
     )
@@ -72,7 +73,10 @@ def stream_keys(seed: int, indices: NDArray[np.integer] | Sequence[int]) -> NDAr
 def _tabulate_group(
     source: Source, params: NDArray, keys: NDArray, sweeps: int, grid: Grid, error: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Values and standard errors (n, bins, 3) from so many sweeps over all rows, in launches that overflow no bin."""
+    """Values and standard errors, each (n, bins, 3), from `sweeps` walks in every row.
+
+    The sweeps are divided into launches short enough that no bin overflows.
+    """
     moments = np.zeros((2 if error else 1, len(params), grid.bins, 3))
     for first in range(0, sweeps, _WALKS_PER_ROW):
         moments += _launch(source, params, keys, first, min(_WALKS_PER_ROW, sweeps - first), grid, error)
@@ -80,7 +84,7 @@ def _tabulate_group(
     if not error:
         return moments[0] / weight, None
     sums, squares = moments
-    # Where every walk hits the bin alike, take the variance of a single hit.
+    # If all walks of a row hit a bin with the same throughput, their variance is 0. Then use that of a single hit.
     variance = np.maximum(squares - sums * sums / sweeps, squares / sweeps)
     return sums / weight, np.sqrt(variance) / weight
 
@@ -88,7 +92,10 @@ def _tabulate_group(
 def _launch(
     source: Source, params: NDArray, keys: NDArray, first: int, sweeps: int, grid: Grid, error: bool
 ) -> NDArray:
-    """Sums of throughputs and, for the error, of their squares (1 or 2, n, bins, 3) over the sweeps from `first` on."""
+    """The sums (1, n, bins, 3) of throughputs over the sweeps `first` .. `first + sweeps - 1`.
+
+    With `error`, also the sums of their squares: (2, n, bins, 3).
+    """
     Float, UInt32, UInt64 = dr.auto.Float, dr.auto.UInt32, dr.auto.UInt64
     n, sweeps, first = len(params), sweeps * max(grid.phi_i, 1), first * max(grid.phi_i, 1)
     thread = dr.arange(UInt32, n * sweeps)
@@ -97,7 +104,7 @@ def _launch(
     columns = [dr.gather(Float, Float(np.ascontiguousarray(c, np.float32)), material) for c in params.T]
     gathered = source.gather(columns)
     key = dr.gather(UInt64, UInt64(keys), material)
-    # A sweep's stream is a function of its material's key and its own number.
+    # The random stream of a sweep depends only on the material's key and on the sweep's number.
     number = UInt64(sweep) + dr.opaque(UInt64, first)
     rng = dr.auto.PCG32(1, _mix(key ^ (number * 0x9E3779B97F4A7C15)), _mix(key + number))
     counters = [dr.zeros(UInt32, n * grid.bins * 3) for _ in range(2 if error else 1)]
@@ -108,7 +115,7 @@ def _launch(
 
 
 def _mix(x: Any) -> Any:
-    """Finaliser of MurmurHash3: neighbouring inputs, unrelated outputs."""
+    """The finaliser of MurmurHash3, which maps neighbouring integers to unrelated ones."""
     x = (x ^ (x >> 33)) * 0xFF51AFD7ED558CCD
     x = (x ^ (x >> 33)) * 0xC4CEB9FE1A85EC53
     return x ^ (x >> 33)
@@ -116,7 +123,7 @@ def _mix(x: Any) -> Any:
 
 @dataclass
 class _State:
-    """A lane's progress through its sweep: it starts its next walk as soon as one is over, so that no lane idles."""
+    """The state of a lane in its sweep. A lane starts its next walk as soon as one has ended, so that no lane idles."""
 
     rng: Any
     row: Any
@@ -127,7 +134,7 @@ class _State:
 def _sweep(
     source: Source, params: Any, rng: Any, offset: Any, phi_row: Any, counters: list[Any], grid: Grid
 ) -> None:
-    """One walk from every row of theta_i, in every lane, counted in the table at `offset`."""
+    """Runs one walk from every row of theta_i in every lane, and counts it in the lane's table, at `offset`."""
     UInt32 = dr.auto.UInt32
 
     def begin(state: _State, fresh: Any) -> _State:
@@ -161,7 +168,7 @@ def _sweep(
 
 
 def bin_index(row: Any, phi_row: Any, wo: Vec3, grid: Grid) -> Any:
-    """Index in a flattened table of the bin of wo, for wi in the bins `row` of theta_i and `phi_row` of phi_i."""
+    """The index, in a flattened table, of the bin that contains wo. `row` and `phi_row` are the bin of wi."""
     UInt32 = dr.auto.UInt32
     o = dr.minimum(UInt32(dr.maximum(wo.z, 0.0) * grid.theta_o), grid.theta_o - 1)
     phi = ops.atan2(wo.y, wo.x)
