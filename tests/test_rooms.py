@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tools import rooms
+from tools import map, rooms
 from tools.layout import crossings, layout
 from tools.map import OUT, WAY, drawing, listing, plan
 
@@ -37,6 +37,26 @@ def test_the_drawing_has_every_room_and_every_arrow():
     assert text.count('<path class="way"') == len(WAY) + 1
     names = re.findall(r'class="name"[^>]*>([^<]+)<', text)
     assert sorted(names) == sorted(room for floor in plan().floors for room in floor)
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (("cli", "attic"), "attic: on no floor"),
+        (("target", "adapter"), "target imports adapter: imports go down"),
+    ],
+)
+def test_imports_that_cannot_be_drawn_are_refused(more, told, monkeypatch):
+    wrong = rooms.imports() | {more}
+    monkeypatch.setattr(rooms, "imports", lambda: wrong)
+    with pytest.raises(SystemExit, match=told):
+        drawing()
+
+
+def test_a_step_of_the_data_needs_an_import(monkeypatch):
+    monkeypatch.setattr(map, "WAY", (*WAY, map.Step("data", "cli", "nothing")))
+    with pytest.raises(SystemExit, match="data and cli do not import each other"):
+        drawing()
 
 
 def test_the_listing_says_what_each_room_is():

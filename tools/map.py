@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -109,7 +109,7 @@ def plan() -> Plan:
     floors = [[*floor, name] if neighbour in floor else [*floor] for floor in rooms.floors()]
     level = {box: n for n, floor in enumerate(floors) for box in floor}
     steps = {(a, b) if level[a] < level[b] else (b, a): step for step in WAY for a, b in [step[:2]]}
-    _check_way(rooms.imports())
+    _check(rooms.imports(), level)
     imports = rooms.reduced(rooms.imports())
     arrows = sorted(imports | set(steps))
     placed = layout(floors, arrows, BOX + GAP, PASSAGE)
@@ -117,12 +117,16 @@ def plan() -> Plan:
     return Plan(floors, imports, steps, placed, _ports(placed, arrows), left)
 
 
-def _check_way(imports: frozenset[Arrow]) -> None:
-    """Data goes from one room of the package to another where one of them imports the other."""
+def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
+    """Stops where imports cannot be drawn, or where no import carries a step of the data."""
+    if unknown := {room for arrow in imports for room in arrow if room not in level}:
+        sys.exit(f"{', '.join(sorted(unknown))}: on no floor; add it to the contract in pyproject.toml")
+    if upwards := [f"{a} imports {b}" for a, b in sorted(imports) if level[a] >= level[b]]:
+        sys.exit(f"{'; '.join(upwards)}: imports go down; see `make lint`")
     for step in WAY:
         ends = {(step.start, step.end), (step.end, step.start)}
         if step.end != OUTSIDE[0] and not ends & imports:
-            sys.exit(f"{step.start} and {step.end} do not import each other; mend WAY in {__file__}")
+            sys.exit(f"{step.start} and {step.end} do not import each other; correct WAY in tools/map.py")
 
 
 def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], float]:
