@@ -87,6 +87,13 @@ def test_a_room_is_told_by_as_many_clauses_as_fit(tmp_path, monkeypatch):
     assert rooms.summary("attic", lambda text: False) == "Old things"
 
 
+def test_the_page_names_registries_that_are_there():
+    named = re.findall(r"`(\w+)` of `([\w/]+\.py)`", (rooms.ROOT / "docs/how-it-is-built.md").read_text())
+    assert len(named) >= 6
+    missing = [f"{name} of {path}" for name, path in named if name not in (rooms.ROOT / path).read_text()]
+    assert not missing
+
+
 @pytest.fixture
 def ladder():
     """Boxes whose order on the lower floor is the reverse of what suits their arrows; one passes a floor."""
