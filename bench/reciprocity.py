@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 import nma
 from bench import frames
-from nma import target
 from nma.adapter import Adapter
-from nma.ops import Vec3
-from nma.target import Blend, Plane
+from nma.ops import Vec3, at_azimuth_0
+from nma.target import Brdf
 
 COSINES = (0.9, 0.5, 0.2)
 
@@ -84,25 +83,22 @@ def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[
 def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Generator) -> Pairs:
     """Views of these cosines, and for each a direction drawn from the blend there."""
     n = len(cosines)
-    wi = Vec3(np.sqrt(1.0 - cosines**2), np.zeros(n), cosines)
-    blend, plane = prepared(adapter, params, wi)
+    wi = at_azimuth_0(cosines)
+    brdf = prepared(adapter, params, wi)
     # Stratified in the number that chooses the lobe.
     u = rng.permutation((np.arange(n) + rng.random(n)) / n), *rng.random((2, n))
-    local, value, pdf = target.sample(blend, plane.enter(wi), *u)
-    wo = plane.leave(local)
+    wo, value, pdf = brdf.sample(wi, *u)
     valid = (pdf > 0.0) & (wo.z > 1e-4)
     wo = Vec3(*(np.where(valid, x, up) for x, up in zip(wo, (0.0, 0.0, 1.0), strict=True)))
-    other, turned = prepared(adapter, params, wo)
     # f cos(theta_i) becomes f cos(theta_o).
-    back = np.stack(target.eval(other, turned.enter(wo), turned.enter(wi))) * wo.z / wi.z
+    back = np.stack(prepared(adapter, params, wo).eval(wo, wi)) * wo.z / wi.z
     weight = np.where(valid, 1.0 / np.where(valid, pdf, 1.0), 0.0)
     return Pairs(np.stack(value) * weight, back * weight)
 
 
-def prepared(adapter: Adapter, params: NDArray, w: Vec3) -> tuple[Blend, Plane]:
-    """The blend for views along `w`, and the frame that it holds in."""
-    columns = [np.full(len(w.z), x) for x in params]
-    return adapter.prepare(columns, w.z), Plane.of(w) if adapter.in_plane else Plane()
+def prepared(adapter: Adapter, params: NDArray, w: Vec3) -> Brdf:
+    """One material seen from every direction `w`."""
+    return adapter.prepare([np.full(len(w.z), x) for x in params], w)
 
 
 if __name__ == "__main__":

@@ -207,6 +207,11 @@ class Vec3(NamedTuple):
 Color = Vec3
 
 
+def at_azimuth_0(cos_theta: Float) -> Vec3:
+    """The unit direction with this cosine to the normal that lies above the x axis."""
+    return Vec3(safe_sqrt(1.0 - cos_theta * cos_theta), 0.0 * cos_theta, cos_theta)
+
+
 def dot(a: Vec3, b: Vec3) -> Float:
     return a.x * b.x + a.y * b.y + a.z * b.z
 

@@ -33,7 +33,7 @@ from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 from nma.target.decode import logit
 from nma.train.batches import Batch
-from nma.train.loss import albedos, blend_of, loss
+from nma.train.loss import albedos, brdf_of, loss
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_albedos_and_their_derivatives_are_unbiased(tables):
 
     def estimate(raw, mu, shift):
         block = batch._replace(mu=jnp.full(rows, mu), albedo_shift=shift)
-        halves = albedos(blend_of([(matrix, raw)], block, recipe), block, recipe)
+        halves = albedos(brdf_of([(matrix, raw)], block, recipe), block, recipe)
         return halves.mean(axis=(0, 2)), (halves[0] * halves[1]).mean(axis=1)
 
     def each(function):

@@ -71,7 +71,7 @@ def test_initial_layers_have_the_spread_of_their_law():
 def test_encodings_are_about_unit_sized_and_finite(name):
     columns = list(materials(2000).T)
     for mu in (0.0, 1e-6, 0.3, 1.0):
-        inputs = encoding.get(name)(columns, np.full(2000, mu))
+        inputs = encoding.get(name)(columns, at_azimuth_0(np.full(2000, mu)))
         stacked = np.stack(np.broadcast_arrays(*inputs), axis=-1)
         assert np.isfinite(stacked).all()
         assert stacked.shape[1] == encoding.size(name, LAYERED3, True)
@@ -83,19 +83,19 @@ def test_encodings_are_about_unit_sized_and_finite(name):
 
 def test_the_raw_encoding_is_the_paper_s_input():
     columns = [float(k) for k in range(13)]
-    assert encoding.raw(columns, 0.25) == [*columns, 0.25]
+    assert encoding.raw(columns, at_azimuth_0(0.25)) == [*columns, 0.25]
     assert encoding.raw(columns, None) == columns
 
 
 def test_encodings_agree_on_all_libraries():
     """The same numbers from plain floats, NumPy and Dr.Jit."""
     params, mu = materials(50), np.linspace(0.0, 1.0, 50)
-    on_numpy = np.stack(np.broadcast_arrays(*encoding.layered3(list(params.T), mu)), axis=-1)
+    on_numpy = np.stack(np.broadcast_arrays(*encoding.layered3(list(params.T), at_azimuth_0(mu))), axis=-1)
     columns = [dr.auto.Float(c.astype(np.float32)) for c in params.T]
-    on_drjit = encoding.layered3(columns, dr.auto.Float(mu.astype(np.float32)))
+    on_drjit = encoding.layered3(columns, at_azimuth_0(dr.auto.Float(mu.astype(np.float32))))
     dr.eval(on_drjit)
     np.testing.assert_allclose(np.stack([x.numpy() for x in on_drjit], axis=-1), on_numpy, atol=2e-5)
-    plain = encoding.layered3(params[7].tolist(), float(mu[7]))
+    plain = encoding.layered3(params[7].tolist(), at_azimuth_0(float(mu[7])))
     assert all(type(x) is float for x in plain)
     np.testing.assert_allclose(plain, on_numpy[7], rtol=1e-12)
 
@@ -105,9 +105,9 @@ def test_an_unknown_encoding_is_refused():
         encoding.get("fourier")
 
 
-def flat(blend):
-    """The numbers of a blend as an array (lanes, size)."""
-    numbers = target.numbers(blend)
+def flat(brdf):
+    """The numbers of its blend as an array (lanes, size)."""
+    numbers = target.numbers(brdf.blend)
     dr.eval(numbers)
     lanes = [np.asarray(x.numpy() if dr.is_array_v(x) else x, np.float64) for x in numbers]
     return np.stack(np.broadcast_arrays(*lanes), axis=-1)
@@ -118,9 +118,9 @@ def flat(blend):
 def test_prepare_agrees_on_numpy_and_dr_jit(form, name):
     adapter = random_adapter(*form, name=name, hidden="2x8")
     params, mu = materials(64), np.random.default_rng(5).random(64)
-    on_numpy = flat(adapter.prepare(list(params.T), mu))
+    on_numpy = flat(adapter.prepare(list(params.T), at_azimuth_0(mu)))
     columns = [dr.auto.Float(c.astype(np.float32)) for c in params.T]
-    on_drjit = flat(adapter.prepare(columns, dr.auto.Float(mu.astype(np.float32))))
+    on_drjit = flat(adapter.prepare(columns, at_azimuth_0(dr.auto.Float(mu.astype(np.float32)))))
     assert np.isfinite(on_numpy).all()
     shape = (64, adapter.size)
     np.testing.assert_allclose(np.broadcast_to(on_drjit, shape), np.broadcast_to(on_numpy, shape), atol=2e-5)

@@ -12,7 +12,7 @@ from nma.params import LAYERED3
 from nma.table import ISOTROPIC, Tables
 from nma.target import PRINCIPLED_PARAMS, STRETCHED_PARAMS, Blend, Principled
 from nma.train.batches import BinSampler, Pool, draw
-from nma.train.loss import bin_means, blend_of
+from nma.train.loss import bin_means, brdf_of
 from nma.train.recipe import CLASS
 
 FALSE_ALARM = 1e-3
@@ -43,7 +43,7 @@ def batch_of(tables, recipe, step=0):
 
 
 def means_of(layers, batch, recipe):
-    return np.asarray(bin_means(blend_of(layers, batch, recipe), batch, recipe))
+    return np.asarray(bin_means(brdf_of(layers, batch, recipe), batch, recipe))
 
 
 def constant_layers(blend, inputs=1, params=PRINCIPLED_PARAMS):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 import nma
 from figures import common
 from figures.direct import evaluator as direct
-from nma import network, target
+from nma import network
 from nma.adapter import encoding
 from nma.cli import console
 from nma.evaluate.metrics import mean_metrics, table_metrics
@@ -124,9 +124,9 @@ def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
     encode, materials = encoding.get(adapter.encoding), params.astype(np.float32)
 
     def at_points(material: jax.Array, wi: Vec3, wo: Vec3) -> jax.Array:
-        inputs = [jnp.broadcast_to(x, wi.z.shape) for x in encode(list(material), wi.z)]
+        inputs = [jnp.broadcast_to(x, wi.z.shape) for x in encode(list(material), wi)]
         raw = network.forward(adapter.layers, jnp.stack(inputs, axis=-1))
-        return jnp.stack(target.eval(adapter.decode(list(raw.T), wi.z), wi, wo), axis=-1)
+        return jnp.stack(adapter.decode(list(raw.T), wi).eval(wi, wo), axis=-1)
 
     run = batched(at_points)
     return lambda number, wi, wo: run(materials[number], wi, wo)

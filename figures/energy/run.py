@@ -19,7 +19,6 @@ import nma
 from figures import common
 from nma import ops, target
 from nma.jit import dr
-from nma.ops import Vec3
 from nma.table import quadrature
 
 ANGLES = 64
@@ -83,16 +82,15 @@ def _albedos(
     adapter: nma.Adapter, params: np.ndarray, mu: np.ndarray, samples: int, shift: float
 ) -> np.ndarray:
     Float, UInt32, Sum = dr.auto.Float, dr.auto.UInt32, dr.auto.Float64
-    flat = target.numbers(adapter.prepare(list(params.T), mu), adapter.target)
+    flat = target.numbers(adapter.prepare(list(params.T), ops.at_azimuth_0(mu)).blend, adapter.target)
     curves = [Float(np.broadcast_to(np.asarray(x, np.float32), len(mu)).copy()) for x in flat]
-    cosines = Float(mu.astype(np.float32))
-    blend = adapter.blend(curves, cosines)
-    wi = Vec3(ops.safe_sqrt(1.0 - cosines * cosines), 0.0 * cosines, cosines)
+    wi = ops.at_azimuth_0(Float(mu.astype(np.float32)))
+    brdf = adapter.from_numbers(curves, wi)
     lattice = [Float(x.astype(np.float32)) for x in ((quadrature.lattice(samples) + shift) % 1.0).T]
 
     def body(k, *sums):
         u = [dr.gather(Float, x, k) for x in lattice]
-        _, value, pdf = target.sample(blend, wi, *u)
+        _, value, pdf = brdf.sample(wi, *u)
         weights = [Sum(dr.select(pdf > 0, c / pdf, 0.0)) for c in value]
         return k + 1, *(s + w for s, w in zip(sums, weights, strict=True))
 

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from nma import network, ops
 from nma.adapter import encoding, weights
-from nma.adapter.encoding import Tangent
 from nma.errors import ParamError, WeightsError
 from nma.network import Layers
-from nma.ops import Float
+from nma.ops import Float, Vec3
 from nma.params import SPACES, ParamSpace
 from nma.target.blend import Blend, bounded
+from nma.target.brdf import Brdf
 from nma.target.decode import (
     TargetParam,
     decode,
@@ -29,6 +29,7 @@ from nma.target.decode import (
     params_from_json,
     params_to_json,
 )
+from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
@@ -131,12 +132,12 @@ class Adapter:
 
     @property
     def anisotropic(self) -> bool:
-        """Whether the view's azimuth matters: `prepare` wants its whole direction."""
+        """Whether the material looks different when it is turned about its normal."""
         return self.encoding in encoding.ANISOTROPIC
 
     @property
     def in_plane(self) -> bool:
-        """Whether the blend holds in the plane of incidence (`nma.target.Plane`) instead of every local frame."""
+        """Whether lobes stretch along the plane of incidence (`nma.target.Plane`)."""
         return any(p.in_plane for p in self.target)
 
     @property
@@ -172,45 +173,52 @@ class Adapter:
                 )
         return given
 
-    def decode(self, raw: Sequence[Float], cos_theta_i: Float) -> Blend:
-        """The blend that the network's outputs mean."""
-        return self._bounded(decode(raw, self.instances, self.target, cos_theta_i), cos_theta_i)
+    def prepare(self, columns: Sequence[Float], wi: Vec3, active: Any = True) -> Brdf:
+        """The material's BRDF seen from `wi`, for one array per parameter column, on Dr.Jit or NumPy (n,).
 
-    def blend(self, flat: Sequence[Float], cos_theta_i: Float) -> Blend:
-        """The blend from its numbers (`numbers`) at cos(theta_i)."""
-        return self._bounded(from_numbers(flat, self.target), cos_theta_i)
-
-    def _bounded(self, blend: Blend, cos_theta_i: Float) -> Blend:
-        return bounded(blend, cos_theta_i) if self.bounded else blend
-
-    def prepare(
-        self,
-        columns: Sequence[Float],
-        cos_theta_i: Float,
-        active: Any = True,
-        tangent: Tangent | None = None,
-    ) -> Blend:
-        """Target parameters for one array per parameter column and cos(theta_i), on Dr.Jit or NumPy (n,).
-
-        Anisotropic adapters want `tangent`, the view direction's x and y, too. Dr.Jit's lanes that are not `active` get
-        parameters without a meaning.
+        `wi` is a unit vector of the local frame. Of Dr.Jit's lanes those that are not `active` get a BRDF without a
+        meaning.
         """
-        inputs = encoding.get(self.encoding)(columns, cos_theta_i if self.directional else None, tangent)
-        if ops.library(*columns, cos_theta_i) == "drjit":
+        inputs = encoding.get(self.encoding)(columns, wi if self.directional else None)
+        if ops.library(*columns, wi.z) == "drjit":
             raw = network.forward_lanes(self.layers, inputs, active)
         else:
-            lanes = np.broadcast_arrays(cos_theta_i, *inputs)[1:]
+            lanes = np.broadcast_arrays(wi.z, *inputs)[1:]
             raw = list(network.forward(self.layers, np.stack(lanes, axis=-1).astype(np.float32)).T)
-        return self.decode(raw, cos_theta_i)
+        return self.decode(raw, wi)
+
+    def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
+        """The BRDF that the network's outputs mean, seen from `wi`."""
+        return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
+
+    def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
+        """The BRDF of what `numbers` returns, one array for each of them, seen from `wi`."""
+        return self._framed(from_numbers(flat, self.target), wi)
+
+    def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
+        blend = bounded(blend, wi.z) if self.bounded else blend
+        return Brdf(blend, Plane.of(wi) if self.in_plane else None)
 
     def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
-        """Target parameters (m, n, size) of m materials (m, columns) at n cosines (n,): curves over cos(theta_i)."""
+        """Target parameters (m, n, size) of m materials (m, columns) at n cosines (n,): curves over cos(theta_i).
+
+        Raises `ParamError` if the azimuth of the view matters, too.
+        """
+        self.check_isotropic()
         p = np.atleast_2d(np.asarray(params, np.float64))
         mu = np.asarray(cos_theta_i, np.float64)
         columns = [np.repeat(c, len(mu)) for c in p.T]
-        flat = numbers(self.prepare(columns, np.tile(mu, len(p))), self.target)
+        flat = numbers(self.prepare(columns, ops.at_azimuth_0(np.tile(mu, len(p)))).blend, self.target)
         lanes = np.broadcast_arrays(*flat)
         return np.stack(lanes, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
+
+    def check_isotropic(self) -> None:
+        """Raises `ParamError` if cos(theta_i) does not say all about the view direction."""
+        if self.anisotropic:
+            raise ParamError(
+                "an anisotropic adapter has no curves over cos(theta_i), as the azimuth of the view matters; "
+                "call `prepare` with whole directions"
+            )
 
     def _check(self, path: Path, dialect: str) -> None:
         """Refuses a network that does not fit its own description, or this version's target."""

@@ -1,4 +1,4 @@
-"""What the network sees: a class's parameters and cos(theta_i), turned into about unit-sized numbers.
+"""What the network sees: a class's parameters and the view direction, turned into about unit-sized numbers.
 
 Written with `nma.ops`, so that training, rendering and generated shaders share it. An encoding's name is stored in the
 weights file.
@@ -11,14 +11,12 @@ from collections.abc import Callable, Sequence
 from nma import ops
 from nma.errors import ParamError, WeightsError
 from nma.microfacet import fresnel_conductor, fresnel_dielectric
-from nma.ops import Float
+from nma.ops import Float, Vec3
 from nma.params import LAYERED3, ParamSpace
 
-# Where the view direction points along the surface: its x and y. Isotropic encodings do not look at it.
-Tangent = tuple[Float, Float]
-# Takes one array per parameter column; cos(theta_i), or None for an adapter whose parameters ignore the direction; and
-# the rest of the direction, which anisotropic encodings need.
-Encoder = Callable[..., list[Float]]
+# Takes one array per parameter column, and the view direction or, for an adapter that ignores it, None. Isotropic
+# encodings look at its z alone, cos(theta_i).
+Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
 # Cosine of 84 degrees: where the reflectance of metals dips before it rises to 1.
 GRAZING = 0.1045
@@ -26,32 +24,26 @@ GRAZING = 0.1045
 MIN_COS_T = 0.05
 
 
-def raw(columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None) -> list[Float]:
+def raw(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """The parameters as they are, then cos(theta_i): the paper's input."""
-    return [*columns] if cos_theta_i is None else [*columns, cos_theta_i]
+    return [*columns] if wi is None else [*columns, wi.z]
 
 
-def direction(
-    columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None
-) -> list[Float]:
+def direction(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """cos(theta_i) alone, scaled to [-1, 1], or the constant 1: the input of an adapter for one material."""
-    return [1.0] if cos_theta_i is None else [2.0 * cos_theta_i - 1.0]
+    return [1.0] if wi is None else [2.0 * wi.z - 1.0]
 
 
-def azimuth(
-    columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None
-) -> list[Float]:
+def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """The whole direction, for one anisotropic material: its cosine, and its azimuth once and twice, both of which fade
     towards normal incidence, where there is none."""
-    if cos_theta_i is None or tangent is None:
-        raise ParamError("the encoding 'azimuth' needs the whole view direction: give `tangent`, its x and y")
-    x, y = tangent
-    return [2.0 * cos_theta_i - 1.0, x, y, x * x - y * y, 2.0 * x * y]
+    if wi is None:
+        raise ParamError("the encoding 'azimuth' reads the view direction; set `directional` in the recipe")
+    x, y, z = wi
+    return [2.0 * z - 1.0, x, y, x * x - y * y, 2.0 * x * y]
 
 
-def layered3(
-    columns: Sequence[Float], cos_theta_i: Float | None, tangent: Tangent | None = None
-) -> list[Float]:
+def layered3(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """Physical quantities of a coated conductor: widths by their logarithm, the conductor by its reflectance inside the
     coat at normal incidence and at 84 degrees, the coat's own Fresnel term at wi and the medium's transmittance along
     the refracted direction."""
@@ -67,9 +59,9 @@ def layered3(
     for cosine in (1.0, GRAZING):
         unit += [fresnel_conductor(cosine, e / eta_top, x / eta_top) for e, x in zip(eta, k, strict=True)]
     unit += albedo
-    if cos_theta_i is not None:
-        fresnel, cos_t = fresnel_dielectric(cos_theta_i, eta_top)
-        unit += [cos_theta_i, fresnel, ops.exp(-sigma_t / ops.maximum(cos_t, MIN_COS_T))]
+    if wi is not None:
+        fresnel, cos_t = fresnel_dielectric(wi.z, eta_top)
+        unit += [wi.z, fresnel, ops.exp(-sigma_t / ops.maximum(cos_t, MIN_COS_T))]
     return [2.0 * x - 1.0 for x in unit]
 
 
@@ -95,4 +87,4 @@ def get(name: str) -> Encoder:
 
 def size(name: str, space: ParamSpace, directional: bool) -> int:
     """Number of network inputs that an encoding makes of a class, with or without the direction."""
-    return len(get(name)([0.5] * space.size, 0.5 if directional else None, (0.5, 0.5)))
+    return len(get(name)([0.5] * space.size, ops.at_azimuth_0(0.5) if directional else None))

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nma import target
 from nma.adapter.adapter import Adapter
 from nma.errors import ParamError
 from nma.ops import Color, Vec3
-from nma.target import Plane
 
 
 class AdapterValues:
@@ -32,6 +30,4 @@ class AdapterValues:
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
         """f cos(theta_o) [1/sr]."""
-        blend = self.adapter.prepare([wi.z * 0.0 + p for p in self.params], wi.z, True, (wi.x, wi.y))
-        plane = Plane.of(wi) if self.adapter.in_plane else Plane()
-        return target.eval(blend, plane.enter(wi), plane.enter(wo))
+        return self.adapter.prepare([wi.z * 0.0 + p for p in self.params], wi).eval(wi, wo)

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ops, target
+from nma import ops
 from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.evaluate import metrics
 from nma.jit import dr
-from nma.ops import Vec3
 from nma.table import ISOTROPIC, Grid, Tables, quadrature
 from nma.table.walks import bin_index
 
@@ -105,11 +104,11 @@ def _by_points(
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
         at = row * directions + k // _POINTS
         mu = dr.gather(Float, cosines, at)
-        blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
+        brdf = adapter.from_numbers([dr.gather(Float, c, at) for c in curves], ops.at_azimuth_0(mu))
         u, v = (quadrature.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True))
         across = mu * grid.theta_i - Float(row)
         points = quadrature.uniform_bin_points(Float(row), o, p, (across, u, v), grid)
-        value, pdf = target.eval_pdf(blend, points.wi, points.wo)
+        value, pdf = brdf.eval_pdf(points.wi, points.wo)
         value = value * (1.0 - _sharpness(pdf))
         return k + 1, red + value.x, green + value.y, blue + value.z
 
@@ -129,11 +128,12 @@ def _by_samples(
     lane = dr.arange(UInt32, len(cosines) * _SAMPLES)
     at, k = lane // _SAMPLES, lane % _SAMPLES
     mu = dr.gather(Float, cosines, at)
-    blend = adapter.blend([dr.gather(Float, c, at) for c in curves], mu)
+    wi = ops.at_azimuth_0(mu)
+    brdf = adapter.from_numbers([dr.gather(Float, c, at) for c in curves], wi)
     lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(_SAMPLES).T]
     shifts = [quadrature.hashed(at * 3 + n, ~seed) for n in range(len(lattice))]
     u = [quadrature.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True)]
-    wo, value, pdf = target.sample(blend, Vec3(ops.safe_sqrt(1.0 - mu * mu), 0.0 * mu, mu), *u)
+    wo, value, pdf = brdf.sample(wi, *u)
     value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
     directions = len(cosines) // grid.theta_i
     index = bin_index(at // directions, UInt32(0), wo, grid)

@@ -18,11 +18,11 @@ from typing import Any
 
 from nma import target
 from nma.adapter import Adapter, shipped, weights_file
-from nma.ops import Color, select
+from nma.ops import Color, Vec3, select
 from nma.render.bsdf import define_base, mean_of_samples, vec3
 from nma.render.curves import MIN_COS, Curves
 from nma.render.inputs import of_adapter
-from nma.target import Blend, Plane
+from nma.target import Brdf
 
 DEFAULT_ADAPTER = "layered3-5x64"
 ALBEDO_POINTS = 128
@@ -67,29 +67,26 @@ def define() -> type:
             return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
 
         def eval_pdf(self, ctx, si, wo, active=True):
-            blend, active = self._prepare(ctx, si, active)
-            return self._eval_pdf(ctx, blend, si, wo, active)
+            brdf, active = self._prepare(ctx, si, active)
+            return self._eval_pdf(ctx, brdf, si, wo, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            blend, active = self._prepare(ctx, si, active)
-            return self._sample(ctx, blend, si, sample1, sample2, active)
+            brdf, active = self._prepare(ctx, si, active)
+            return self._sample(ctx, brdf, si, sample1, sample2, active)
 
         def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
-            blend, active = self._prepare(ctx, si, active)
-            found = self._eval_pdf(ctx, blend, si, wo, active)
-            return *found, *self._sample(ctx, blend, si, sample1, sample2, active)
+            brdf, active = self._prepare(ctx, si, active)
+            found = self._eval_pdf(ctx, brdf, si, wo, active)
+            return *found, *self._sample(ctx, brdf, si, sample1, sample2, active)
 
-        def _eval_pdf(self, ctx, blend: Blend, si, wo, active):
-            plane = self._plane(si)
-            value, pdf = target.eval_pdf(blend, plane.enter(vec3(si.wi)), plane.enter(vec3(wo)))
+        def _eval_pdf(self, ctx, brdf: Brdf, si, wo, active):
+            value, pdf = brdf.eval_pdf(vec3(si.wi), vec3(wo))
             if self._from_light(ctx):
                 value = self._towards_camera(si, wo, active)
             return mi.Color3f(*value) & active, pdf & active
 
-        def _sample(self, ctx, blend: Blend, si, sample1, sample2, active):
-            plane = self._plane(si)
-            wo, value, pdf = target.sample(blend, plane.enter(vec3(si.wi)), sample1, sample2.x, sample2.y)
-            wo = plane.leave(wo)
+        def _sample(self, ctx, brdf: Brdf, si, sample1, sample2, active):
+            wo, value, pdf = brdf.sample(vec3(si.wi), sample1, sample2.x, sample2.y)
             if self._from_light(ctx):
                 value = self._towards_camera(si, mi.Vector3f(*wo), active & (pdf > 0))
             return self._sampled(wo, pdf, value * (1.0 / select(pdf > 0, pdf, 1.0)), active)
@@ -101,21 +98,19 @@ def define() -> type:
         def _towards_camera(self, si, wo, active) -> Color:
             """f cos(theta_o) of light that arrives along `si.wi` and goes on to the camera along `wo`.
 
-            The view is `wo` then, so the blend is prepared there: paths from the light see what those from the camera
-            do, although swapping the directions of a blend gives another value. Samples are drawn as for `si.wi`.
+            The view is `wo` then, so the BRDF is prepared there: paths from the light see what those from the camera
+            do, although swapping the directions of a BRDF gives another value. Samples are drawn as for `si.wi`.
             """
             turned = mi.SurfaceInteraction3f(si)
             turned.wi = wo
-            blend, plane = self._blend(turned, active, active & (wo.z > 0)), self._plane(turned)
-            value = target.eval(blend, plane.enter(vec3(wo)), plane.enter(vec3(si.wi)))
-            return value * (wo.z / si.wi.z)
+            brdf = self._brdf(turned, active, active & (wo.z > 0))
+            return brdf.eval(vec3(wo), vec3(si.wi)) * (wo.z / si.wi.z)
 
         def _albedo(self, si, active) -> Color:
-            blend, plane = self._blend(si, active, active), self._plane(si)
-            wi = plane.enter(vec3(si.wi))
+            brdf = self._brdf(si, active, active)
 
             def draw(k, *u):
-                _, value, pdf = target.sample(blend, wi, *u)
+                _, value, pdf = brdf.sample(vec3(si.wi), *u)
                 return value * select(pdf > 0, 1.0 / select(pdf > 0, pdf, 1.0), 0.0)
 
             return mean_of_samples(draw, ALBEDO_POINTS, active)
@@ -126,36 +121,29 @@ def define() -> type:
                 return None
             return Curves(self.adapter, self.inputs.columns())
 
-        def _prepare(self, ctx, si, active) -> tuple[Blend, Any]:
-            """The blend at `si`, and the lanes that see the front."""
+        def _prepare(self, ctx, si, active) -> tuple[Brdf, Any]:
+            """The BRDF at `si`, and the lanes that see the front."""
             front = self._front(ctx, si, active)
-            return self._blend(si, active, front), front
+            return self._brdf(si, active, front), front
 
-        def _blend(self, si, active, front) -> Blend:
-            """The blend at `si`.
+        def _brdf(self, si, active, front) -> Brdf:
+            """The BRDF at `si`.
 
             Of one point Mitsuba asks for the value and then for a sample, even where one call could give both: it does
             not call `eval_pdf_sample` of Python BSDFs. The second takes what the first left in the same basic block.
             """
             self.inputs.check()
-            cos_theta_i = dr.clip(si.wi.z, MIN_COS, 1.0)
+            wi = Vec3(si.wi.x, si.wi.y, dr.clip(si.wi.z, MIN_COS, 1.0))
             if self._curves is not None:
-                return self._curves.at(
-                    cos_theta_i, self.inputs.columns() if self._curves.slopes else [], front
-                )
+                return self._curves.at(wi, self.inputs.columns() if self._curves.slopes else [], front)
             asked = dr.detach(mi.SurfaceInteraction3f(si)), active
-            if blend := self._recorded.take(asked, dr.grad_enabled(attached)):
-                return blend
-            columns, tangent = self.inputs.columns(si, front), (si.wi.x, si.wi.y)
-            blend = self.adapter.prepare(columns, cos_theta_i, front, tangent)
-            derived = dr.grad_enabled(target.numbers(blend, self.adapter.target))
+            if brdf := self._recorded.take(asked, dr.grad_enabled(attached)):
+                return brdf
+            brdf = self.adapter.prepare(self.inputs.columns(si, front), wi, front)
+            derived = dr.grad_enabled(target.numbers(brdf.blend, self.adapter.target))
             if si.wi.z.state == dr.VarState.Symbolic and not derived:
-                self._recorded.leave(asked, dr.grad_enabled(attached), blend)
-            return blend
-
-        def _plane(self, si) -> Plane:
-            """The frame that the blend holds in."""
-            return Plane.of(vec3(si.wi)) if self.adapter.in_plane else Plane()
+                self._recorded.leave(asked, dr.grad_enabled(attached), brdf)
+            return brdf
 
     return Nma
 
@@ -173,7 +161,7 @@ def _loaded(name_or_path: str, stamp: tuple[int, int] | None) -> Adapter:
 
 
 class _Recorded:
-    """The blend that a call prepared while Dr.Jit recorded it, for the next call in the same basic block.
+    """The BRDF that a call prepared while Dr.Jit recorded it, for the next call in the same basic block.
 
     Elsewhere its variables may not exist: Dr.Jit records all callables of a virtual call with the same arguments, in
     scopes that begin anew. So what was prepared is followed by a scope of its own, and only that may take it. The
@@ -183,15 +171,15 @@ class _Recorded:
     """
 
     def __init__(self) -> None:
-        self._left: tuple[list[int], Any, Blend] | None = None
+        self._left: tuple[list[int], Any, Brdf] | None = None
 
-    def leave(self, asked: Any, attached: bool, blend: Blend) -> None:
+    def leave(self, asked: Any, attached: bool, brdf: Brdf) -> None:
         from nma.jit import dr
 
         dr.detail.new_scope(dr.backend_v(asked[0].wi))
-        self._left = _key(asked, attached), asked, blend
+        self._left = _key(asked, attached), asked, brdf
 
-    def take(self, asked: Any, attached: bool) -> Blend | None:
+    def take(self, asked: Any, attached: bool) -> Brdf | None:
         left, self._left = self._left, None
         return left[2] if left and left[0] == _key(asked, attached) else None
 

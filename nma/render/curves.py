@@ -8,8 +8,8 @@ from typing import Any
 from nma import network
 from nma.adapter import Adapter, encoding
 from nma.jit import dr
-from nma.ops import Float
-from nma.target.blend import Blend
+from nma.ops import Float, Vec3, at_azimuth_0
+from nma.target.brdf import Brdf
 from nma.target.decode import numbers
 
 # Over draws from the training ranges, values at the blend's own samples differed by 1e-4 on average from those of the
@@ -38,7 +38,10 @@ class Curves:
             adapter: whose network is evaluated.
             columns: `mi.Float` of width 1 for each column of the class's parameter vector.
             nodes: number of cosines; two will do if the target ignores the direction.
+
+        Raises `ParamError` for anisotropic adapters.
         """
+        adapter.check_isotropic()
         mi = _mitsuba()
         self.adapter = adapter
         self.nodes = nodes if adapter.directional else 2
@@ -54,20 +57,21 @@ class Curves:
             k: self._slope(columns, k) for k, column in enumerate(columns) if dr.grad_enabled(column)
         }
 
-    def at(self, cos_theta_i: Float, columns: Sequence[Float], active: Any = True) -> Blend:
-        """The blend at cos(theta_i) in 0..1; `columns` are those that the curves were made from, for derivatives."""
-        flat = self._looked_up(self.table, cos_theta_i, active)
+    def at(self, wi: Vec3, columns: Sequence[Float], active: Any = True) -> Brdf:
+        """The BRDF seen from `wi`; `columns` are those that the curves were made from, for derivatives."""
+        flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
                 change = columns[k] - dr.detach(columns[k])  # 0, but for its derivative
-                steps = self._looked_up(slope, cos_theta_i, active)
+                steps = self._looked_up(slope, wi.z, active)
                 flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
-        return self.adapter.blend(flat, cos_theta_i)
+        return self.adapter.from_numbers(flat, wi)
 
     def _tabulated(self, columns: Sequence[Float]) -> Float:
         """Node by node, filled up to whole packets."""
         cosines = dr.maximum(dr.linspace(_mitsuba().Float, 0.0, 1.0, self.nodes), MIN_COS)
-        flat = numbers(_prepare(self.adapter, self.layers, columns, cosines), self.adapter.target)
+        made = _prepare(self.adapter, self.layers, columns, at_azimuth_0(cosines))
+        flat = numbers(made.blend, self.adapter.target)
         return _interleaved(flat + [0.0] * (self.packets * PACKET - self.adapter.size), self.nodes)
 
     def _slope(self, columns: Sequence[Float], k: int) -> Float:
@@ -98,13 +102,13 @@ class Curves:
         return dr.gather(_mitsuba().ArrayXf, table, index, active, shape=(PACKET, dr.width(index)))
 
 
-def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], cos_theta_i: Float) -> Blend:
+def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], wi: Vec3) -> Brdf:
     """`Adapter.prepare` by products of matrices: a few small kernels instead of a large one to compile."""
     mi = _mitsuba()
-    inputs = encoding.get(adapter.encoding)(columns, cos_theta_i if adapter.directional else None)
-    x = mi.TensorXf(_interleaved(inputs, dr.width(cos_theta_i)), (dr.width(cos_theta_i), len(inputs)))
+    inputs = encoding.get(adapter.encoding)(columns, wi if adapter.directional else None)
+    x = mi.TensorXf(_interleaved(inputs, dr.width(wi.z)), (dr.width(wi.z), len(inputs)))
     raw = network.forward(layers, x)
-    return adapter.decode([raw[:, k].array for k in range(adapter.size)], cos_theta_i)
+    return adapter.decode([raw[:, k].array for k in range(adapter.size)], wi)
 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:

@@ -1,6 +1,7 @@
 """The analytic BRDF that adapters drive: a blend of Principled BRDFs, written once for every array library."""
 
 from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, sample
+from nma.target.brdf import Brdf
 from nma.target.decode import (
     ANISOTROPIC_PARAMS,
     MEASURED_PARAMS,
@@ -24,6 +25,7 @@ __all__ = [
     "STRETCHED_PARAMS",
     "TARGETS",
     "Blend",
+    "Brdf",
     "Plane",
     "Principled",
     "TargetParam",

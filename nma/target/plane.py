@@ -11,8 +11,8 @@ from nma.ops import Float, Vec3
 class Plane(NamedTuple):
     """A turn about the normal, given by cosine and sine of the azimuth that becomes 0."""
 
-    cos_phi: Float = 1.0
-    sin_phi: Float = 0.0
+    cos_phi: Float
+    sin_phi: Float
 
     @staticmethod
     def of(wi: Vec3) -> Plane:

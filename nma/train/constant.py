@@ -17,10 +17,10 @@ from nma.evaluate.metrics import table_metrics
 from nma.ops import Color
 from nma.params import SPACES
 from nma.table import ISOTROPIC, Tables
-from nma.target import PRINCIPLED_PARAMS, Blend, Principled, TargetParam
+from nma.target import PRINCIPLED_PARAMS, Blend, Brdf, Principled, TargetParam
 from nma.train import loop
 from nma.train.batches import Batch, BinSampler, Pool, draw
-from nma.train.loss import blend_loss
+from nma.train.loss import brdf_loss
 from nma.train.recipe import Recipe
 from nma.train.run import record_of
 
@@ -145,7 +145,7 @@ def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array,
     """The sum over all fits, as none knows of the others, and the log loss of the best."""
 
     def one(numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return blend_loss(target.decode(list(numbers), 1, CONSTANT_PARAMS), batch, recipe)
+        return brdf_loss(Brdf(target.decode(list(numbers), 1, CONSTANT_PARAMS)), batch, recipe)
 
     totals, log_losses = jax.vmap(one)(raw)
     return totals.sum(), log_losses.min()

@@ -21,7 +21,7 @@ from nma.progress import of_training
 from nma.table import ISOTROPIC, Tables
 from nma.train import loop
 from nma.train.batches import Batch, BinSampler, Pool, draw
-from nma.train.loss import bin_means, blend_of, distance, loss
+from nma.train.loss import bin_means, brdf_of, distance, loss
 from nma.train.recipe import Recipe
 from nma.train.run import adapter_of, initial_layers
 
@@ -185,6 +185,6 @@ def _sampled_log_loss(code: jax.Array, layers: Any, batches: Batch, recipe: Reci
     def of_batch(batch: Batch) -> jax.Array:
         columns: Any = jnp.broadcast_to(code[:, None], (len(code), len(batch.mu)))
         batch = batch._replace(columns=columns)
-        return distance(bin_means(blend_of(layers, batch, recipe), batch, recipe), batch, recipe)[1]
+        return distance(bin_means(brdf_of(layers, batch, recipe), batch, recipe), batch, recipe)[1]
 
     return jax.lax.map(of_batch, batches).mean()

@@ -15,6 +15,7 @@ from nma.adapter import encoding
 from nma.network import Layers
 from nma.ops import Vec3
 from nma.table import quadrature
+from nma.target import Brdf
 from nma.train.batches import Batch
 from nma.train.recipe import Recipe
 
@@ -25,23 +26,22 @@ _TOLERANCE = 0.003
 def network_outputs(layers: Layers, batch: Any, recipe: Recipe) -> jax.Array:
     """(rows, numbers of the target), one pass of the network per row, at its cosine `mu`."""
     wi = view(batch)
-    inputs = encoding.get(recipe.encoding)(
-        list(batch.columns), wi.z if recipe.directional else None, (wi.x, wi.y)
-    )
+    inputs = encoding.get(recipe.encoding)(list(batch.columns), wi if recipe.directional else None)
     return network.forward(layers, jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1))
 
 
-def blend_of(layers: Layers, batch: Any, recipe: Recipe) -> target.Blend:
-    """The target of each row, (rows,)."""
+def brdf_of(layers: Layers, batch: Any, recipe: Recipe) -> Brdf:
+    """The target of each row, (rows,). Isotropic batches look from the azimuth 0, where the local frame is that of the
+    plane of incidence."""
     raw = network_outputs(layers, batch, recipe)
     blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
-    return target.bounded(blend, batch.mu) if recipe.bounds_energy else blend
+    return Brdf(target.bounded(blend, batch.mu) if recipe.bounds_energy else blend)
 
 
-def bin_means(blend: target.Blend, batch: Batch, recipe: Recipe) -> jax.Array:
+def bin_means(brdf: Brdf, batch: Batch, recipe: Recipe) -> jax.Array:
     """The target's mean over each bin, (3, bins_per_row, rows)."""
     points = _points(batch, recipe)
-    value = target.eval(blend, points.wi, points.wo)
+    value = brdf.eval(points.wi, points.wo)
     return jnp.stack([(c * points.weight).mean(axis=0) for c in value])
 
 
@@ -62,7 +62,7 @@ def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
     return quadrature.points((batch.i, batch.a, batch.o, batch.p), tuple(u), recipe.grid, finest)
 
 
-def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
+def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
     """Two independent unbiased estimates of the target's directional albedo, (2, 3, rows), from its own samples.
 
     The samples are held fixed while the target changes, so that derivatives are unbiased too, and none is clipped.
@@ -70,29 +70,29 @@ def albedos(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array:
     lattice = jnp.asarray(quadrature.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
     wi = view(batch)
-    wo, _, pdf = target.sample(jax.lax.stop_gradient(blend), wi, *u)
-    value = target.eval(blend, wi, wo)
+    wo, _, pdf = jax.lax.stop_gradient(brdf).sample(wi, *u)
+    value = brdf.eval(wi, wo)
     weight = jnp.where(pdf > 0, 1.0 / jnp.maximum(pdf, 1e-9), 0.0)
     return jnp.stack([(c * weight).mean(axis=1) for c in value], axis=1)
 
 
 def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
     """(what is minimised, the log loss of eq. 7 against the noisy tables)."""
-    return blend_loss(blend_of(layers, batch, recipe), batch, recipe)
+    return brdf_loss(brdf_of(layers, batch, recipe), batch, recipe)
 
 
-def blend_loss(blend: target.Blend, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The same for a blend, of numbers that are constant or (rows,)."""
-    total, log_loss = distance(bin_means(blend, batch, recipe), batch, recipe)
-    return total + albedo_loss(blend, batch, recipe), log_loss
+def brdf_loss(brdf: Brdf, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
+    """The same for a target of numbers that are constant or (rows,)."""
+    total, log_loss = distance(bin_means(brdf, batch, recipe), batch, recipe)
+    return total + albedo_loss(brdf, batch, recipe), log_loss
 
 
-def albedo_loss(blend: target.Blend, batch: Any, recipe: Recipe) -> jax.Array | float:
+def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     """The recipe's weight of the squared error of the directional albedo, times that."""
     if not recipe.albedo > 0:
         return 0.0
     # The product of two independent errors has the squared error as its mean, without the estimate's variance.
-    first, second = albedos(blend, batch, recipe) - batch.albedo
+    first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 
 

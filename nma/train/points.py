@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import ops, target
+from nma import ops
 from nma.errors import SourceError
 from nma.jit import dr
 from nma.microfacet import visible_normal_pdf
@@ -23,7 +23,7 @@ from nma.ops import Vec3
 from nma.sources.base import Values
 from nma.table import quadrature
 from nma.target.sampling import sample_spec
-from nma.train.loss import albedo_loss, blend_of, view
+from nma.train.loss import albedo_loss, brdf_of, view
 from nma.train.recipe import Recipe
 
 # View directions of the pool, and points wo of each.
@@ -143,8 +143,8 @@ def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
 
 def points_loss(layers: Any, batch: PointBatch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
     """(what is minimised, the log loss of eq. 7 at the points). For `nma.train.loop`, in place of the loss of bins."""
-    blend = blend_of(layers, batch, recipe)
-    value = jnp.stack(list(target.eval(blend, view(batch), Vec3(*batch.wo))))
+    brdf = brdf_of(layers, batch, recipe)
+    value = jnp.stack(list(brdf.eval(view(batch), Vec3(*batch.wo))))
     log_loss = (jnp.abs(jnp.log1p(value) - jnp.log1p(batch.value)) * batch.weight).mean()
     energy = (jnp.abs(value - batch.value) * batch.weight).mean()
-    return log_loss + recipe.energy * energy + albedo_loss(blend, batch, recipe), log_loss
+    return log_loss + recipe.energy * energy + albedo_loss(brdf, batch, recipe), log_loss

@@ -1,0 +1,41 @@
+"""The analytic BRDF for a view direction: a blend in the frame that it holds in. `Adapter.prepare` returns it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from nma.ops import Color, Float, Vec3
+from nma.target import blend as lobes
+from nma.target.blend import Blend
+from nma.target.plane import Plane
+
+
+class Brdf(NamedTuple):
+    """A blend and its frame, prepared once for a view direction `wi` per lane, then evaluated and sampled.
+
+    `plane` is the plane of incidence if lobes stretch along it. It is None if the blend holds in the local frame.
+    All directions are unit vectors of the local frame; `wi` is the one that the BRDF was prepared for.
+    """
+
+    blend: Blend
+    plane: Plane | None = None
+
+    def eval(self, wi: Vec3, wo: Vec3) -> Color:
+        """f cos(theta_o) [1/sr], zero below the horizon."""
+        return lobes.eval(self.blend, self._enter(wi), self._enter(wo))
+
+    def pdf(self, wi: Vec3, wo: Vec3) -> Float:
+        """Density of `sample` per solid angle of `wo` [1/sr]."""
+        return lobes.pdf(self.blend, self._enter(wi), self._enter(wo))
+
+    def eval_pdf(self, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
+        """What `eval` and `pdf` return, for the price of one."""
+        return lobes.eval_pdf(self.blend, self._enter(wi), self._enter(wo))
+
+    def sample(self, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
+        """Direction `wo` from three uniform numbers in [0, 1), with `eval_pdf` of it; pdf == 0: an invalid sample."""
+        wo, value, pdf = lobes.sample(self.blend, self._enter(wi), u_lobe, u1, u2)
+        return (wo if self.plane is None else self.plane.leave(wo)), value, pdf
+
+    def _enter(self, v: Vec3) -> Vec3:
+        return v if self.plane is None else self.plane.enter(v)
