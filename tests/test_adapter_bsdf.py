@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -19,6 +18,7 @@ from nma.jit import dr
 from nma.ops import Vec3
 from nma.params import LAYERED3
 from nma.render.textures import bitmap_texture
+from nma.target import Brdf
 
 nma.render.use("llvm_ad_rgb")
 TEXTURED = {"alpha_bottom": 0.3, "albedo": [0.9, 0.3, 0.2], "sigma_t": 0.7}
@@ -96,8 +96,8 @@ def test_values_are_those_of_the_adapter(weights, make):
     adapter = Adapter.load(weights)
     wi = np.array(si.wi, np.float64)
     flat = adapter.numbers(LAYERED3.vector(NUMBERS), wi[2])[0].astype(np.float64)
-    blend = target.from_numbers(list(flat.T), adapter.target)
-    expected, density = target.eval_pdf(blend, Vec3(*wi), Vec3(*np.array(wo, np.float64)))
+    brdf = adapter.from_numbers(list(flat.T), Vec3(*wi))
+    expected, density = brdf.eval_pdf(Vec3(*wi), Vec3(*np.array(wo, np.float64)))
     for found, wanted in ((value, np.stack(expected)), (pdf, density)):
         error = np.abs(np.array(found) - wanted) / wanted
         # Near a narrow peak single precision shows.
@@ -114,8 +114,8 @@ def test_every_variant_is_shown(tmp_path, instances, directional):
     found = mi.load_dict(description(tmp_path / "w.safetensors")).eval(mi.BSDFContext(), si, wo)
     wi = np.array(si.wi, np.float64)
     flat = adapter.numbers(LAYERED3.vector(NUMBERS), wi[2])[0].astype(np.float64)
-    blend = target.from_numbers(list(flat.T), adapter.target)
-    close(found, np.stack(target.eval(blend, Vec3(*wi), Vec3(*np.array(wo, np.float64)))), rtol=1e-2)
+    brdf = adapter.from_numbers(list(flat.T), Vec3(*wi))
+    close(found, np.stack(brdf.eval(Vec3(*wi), Vec3(*np.array(wo, np.float64)))), rtol=1e-2)
 
 
 @pytest.mark.parametrize("make", (description, textured))
@@ -127,12 +127,11 @@ def test_stretched_lobes_turn_with_the_view(stretched_weights, make):
     adapter, wi = Adapter.load(stretched_weights), np.array(si.wi, np.float64)
     assert adapter.in_plane
     flat = adapter.numbers(LAYERED3.vector(NUMBERS), wi[2])[0].astype(np.float64)
-    blend = adapter.blend(list(flat.T), wi[2])
-    assert np.abs(blend.instances[0].anisotropic).max() > 0.5
-    assert np.min(blend.scale) < 0.95
-    plane = target.Plane.of(Vec3(*wi))
-    local = [plane.enter(Vec3(*np.array(w, np.float64))) for w in (si.wi, wo)]
-    expected = [np.where(valid, x, 0.0) for x in (*target.eval(blend, *local), target.pdf(blend, *local))]
+    brdf = adapter.from_numbers(list(flat.T), Vec3(*wi))
+    assert np.abs(brdf.blend.instances[0].anisotropic).max() > 0.5
+    assert np.min(brdf.blend.scale) < 0.95
+    value, pdf = brdf.eval_pdf(Vec3(*wi), Vec3(*np.array(wo, np.float64)))
+    expected = [np.where(valid, x, 0.0) for x in (*value, pdf)]
     for angle in (0.0, 0.7, 2.9):
         turn = mi.Transform4f().rotate([0, 0, 1], math.degrees(angle))
         turned, _ = interactions(2000)
@@ -248,12 +247,15 @@ def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
     """In the kernel of a path tracer, which asks for a value and for a sample each time its loop is recorded."""
     calls = []
 
-    def counted(function, *arguments):
-        calls.append(function.__name__)
-        return function(*arguments)
+    def counted(function):
+        def call(*arguments):
+            calls.append(function.__name__)
+            return function(*arguments)
 
-    for module, name in ((network, "forward_lanes"), (target, "eval_pdf"), (target, "sample")):
-        monkeypatch.setattr(module, name, partial(counted, getattr(module, name)))
+        return call
+
+    for owner, name in ((network, "forward_lanes"), (Brdf, "eval_pdf"), (Brdf, "sample")):
+        monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
     dr.eval(mi.render(scene(textured(weights)), spp=1))
     assert calls.count("forward_lanes") == calls.count("eval_pdf") == calls.count("sample") > 0
     # Elsewhere nothing is kept.

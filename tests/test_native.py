@@ -9,6 +9,7 @@ from nma import network
 from nma.adapter import encoding
 from nma.errors import MissingDependencyError
 from nma.native import build
+from nma.ops import at_azimuth_0
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_python_reaches_the_batched_kernel(tmp_path):
     rng = np.random.default_rng(0)
     params, cosines = nma.LAYERED3.sample(rng, 500), rng.uniform(0.05, 1, 500)
     adapter = nma.Adapter.load("layered3-3x32")
-    inputs = encoding.get(adapter.encoding)(list(params.T), cosines)
+    inputs = encoding.get(adapter.encoding)(list(params.T), at_azimuth_0(cosines))
     wanted = network.forward(adapter.layers, np.stack(inputs, axis=-1))
     for name in available():
         runtime = Runtime("layered3-3x32", name)

@@ -10,6 +10,7 @@ from nma import network, target
 from nma.adapter import encoding
 from nma.errors import NmaError, WeightsError
 from nma.jit import dr
+from nma.ops import at_azimuth_0
 from nma.params import LAYERED3
 from nma.target import PRINCIPLED_PARAMS
 
@@ -147,7 +148,8 @@ def test_curves_are_the_prepared_numbers():
     curves = adapter.numbers(params, mu)
     for m in range(3):
         for k in range(3):
-            single = flat(adapter.prepare([np.array([c]) for c in params[m]], mu[k : k + 1]))
+            wi = at_azimuth_0(mu[k : k + 1])
+            single = flat(adapter.prepare([np.array([c]) for c in params[m]], wi))
             np.testing.assert_allclose(curves[m, k], single[0], atol=1e-6)
 
 

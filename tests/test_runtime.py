@@ -13,7 +13,7 @@ import nma
 from nma import network, target
 from nma.adapter import encoding, weights_file
 from nma.native.runtime import INSTRUCTION_SETS, Runtime, available
-from nma.ops import Vec3
+from nma.ops import Vec3, at_azimuth_0
 from nma.params import MEASURED
 
 CASES = 4000
@@ -105,7 +105,9 @@ def queries(seed):
 def test_network_outputs_agree_on_every_instruction_set(name, compact):
     adapter = nma.Adapter.load(name)
     params, cosines = queries(3)
-    inputs = encoding.get(adapter.encoding)(list(params.T.astype(np.float64)), cosines.astype(np.float64))
+    inputs = encoding.get(adapter.encoding)(
+        list(params.T.astype(np.float64)), at_azimuth_0(cosines.astype(np.float64))
+    )
     layers = rounded(adapter.layers) if compact else adapter.layers
     wanted = network.forward(layers, np.stack(inputs, axis=-1))
     found = {}
@@ -147,7 +149,8 @@ def test_an_adapter_evaluates_like_the_package():
     adapter, rng = nma.Adapter.load("layered3-3x32"), np.random.default_rng(4)
     params = nma.LAYERED3.sample(rng, CASES).astype(np.float32)
     wi, wo = (rows(random_directions(rng, CASES)).astype(np.float32) for _ in range(2))
-    value, pdf = target.eval_pdf(adapter.prepare(list(params.T), wi.T[2]), Vec3(*wi.T), Vec3(*wo.T))
+    i, o = Vec3(*wi.T), Vec3(*wo.T)
+    value, pdf = adapter.prepare(list(params.T), i).eval_pdf(i, o)
     for instruction_set in in_single_precision():
         loaded = Runtime("layered3-3x32", instruction_set)
         found = np.column_stack(loaded.eval_pdf(loaded.prepare(params, wi.T[2]), wi, wo))
@@ -163,9 +166,8 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
     adapter = nma.Adapter(MEASURED, "direction", layers, 2, True, target.MEASURED_PARAMS)
     adapter.save(tmp_path / "single.safetensors")
     wi, wo = (rows(random_directions(rng, CASES)).astype(np.float32) for _ in range(2))
-    plane = target.Plane.of(Vec3(*wi.T))
-    blend = adapter.prepare([], wi.T[2])
-    value, pdf = target.eval_pdf(blend, *(plane.enter(Vec3(*w.T)) for w in (wi, wo)))
+    i, o = Vec3(*wi.T), Vec3(*wo.T)
+    value, pdf = adapter.prepare([], i).eval_pdf(i, o)
     assert 0.05 < (value.x == 0).mean() < 0.95
     for instruction_set in in_single_precision():
         loaded = Runtime(tmp_path / "single.safetensors", instruction_set)

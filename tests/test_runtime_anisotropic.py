@@ -11,7 +11,7 @@ from runtime_cases import facing, pointer, rows
 from target_cases import random_directions
 
 import nma
-from nma import network, target
+from nma import network
 from nma.adapter import encoding
 from nma.errors import ParamError
 from nma.native.runtime import Runtime, available
@@ -41,14 +41,8 @@ def directions(seed):
 
 def outputs(adapter, wi):
     """What the package's network returns, (n, size)."""
-    x, y, z = wi.T.astype(np.float64)
-    inputs = encoding.get(adapter.encoding)([], z, (x, y))
+    inputs = encoding.get(adapter.encoding)([], Vec3(*wi.T.astype(np.float64)))
     return network.forward(adapter.layers, np.stack(inputs, axis=-1))
-
-
-def blend(adapter, wi):
-    x, y, z = wi.T
-    return adapter.prepare([], z, tangent=(x, y))
 
 
 def none():
@@ -83,9 +77,9 @@ def test_values_densities_and_samples_are_those_of_the_package(case):
     adapter, path = case
     wi, wo = directions(2), directions(3)
     u = np.random.default_rng(4).random((CASES, 3), np.float32)
-    own = blend(adapter, wi)
-    value, pdf = target.eval_pdf(own, Vec3(*wi.T), Vec3(*wo.T))
-    drawn = target.sample(own, Vec3(*wi.T), *u.T)
+    own = adapter.prepare([], Vec3(*wi.T))
+    value, pdf = own.eval_pdf(Vec3(*wi.T), Vec3(*wo.T))
+    drawn = own.sample(Vec3(*wi.T), *u.T)
     values = np.stack([*value, pdf], axis=-1)
     samples = np.stack([*drawn[0], *drawn[1], drawn[2]], axis=-1)
     for instruction_set in available():

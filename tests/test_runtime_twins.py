@@ -14,6 +14,7 @@ from nma import Runtime
 from nma.adapter import encoding
 from nma.adapter.adapter import SAME
 from nma.native.runtime import _COMPACT, INSTRUCTION_SETS
+from nma.ops import Vec3
 from nma.params import LAYERED3, LIBRARY, MEASURED
 from nma.render import curves
 from nma.target.decode import TARGETS, decode, output_size
@@ -83,9 +84,8 @@ def test_networks_read_the_same_inputs(tmp_path, name, directional):
     inputs, size = encoding.size(name, space, directional), output_size(4, params)
     path = saved(tmp_path, space, name, 4, directional, params, np.eye(size, inputs), np.zeros(size))
     numbers, wi = drawn(space, rng), views(rng)
-    x, y, z = wi.astype(np.float64).T
     columns = list(numbers.astype(np.float64).T)
-    wanted = encoding.get(name)(columns, z if directional else None, (x, y))
+    wanted = encoding.get(name)(columns, Vec3(*wi.astype(np.float64).T) if directional else None)
     wanted = np.stack([np.broadcast_to(column, CASES) for column in wanted], axis=-1)
     for instruction_set in in_single_precision():
         found = Runtime(path, instruction_set).outputs(numbers, wi)

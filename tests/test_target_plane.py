@@ -31,4 +31,3 @@ def test_normal_incidence_has_the_plane_of_the_x_axis():
     one = np.ones(2, np.float32)
     plane = Plane.of(Vec3(0.0 * one, 0.0 * one, one))
     np.testing.assert_array_equal(np.stack([plane.cos_phi, plane.sin_phi]), [one, 0.0 * one])
-    assert Plane() == (1.0, 0.0)

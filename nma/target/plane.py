@@ -1,4 +1,4 @@
-"""The plane of incidence as a frame: where isotropic materials with stretched lobes are evaluated and sampled."""
+"""The plane of incidence as a frame: isotropic materials with stretched lobes are evaluated and sampled in it."""
 
 from __future__ import annotations
 

@@ -1,0 +1,172 @@
+"""What adapters of every kind prepare: a BRDF in its frame, whose methods agree wherever the view direction points."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from target_cases import random_directions, stacked
+
+import nma.render
+from nma import target
+from nma.adapter import Adapter, encoding
+from nma.errors import ParamError
+from nma.ops import Color, Vec3
+from nma.params import LAYERED3, MEASURED
+from nma.render.curves import Curves
+from nma.target import Blend, Plane, Principled
+
+nma.render.use("llvm_ad_rgb")
+
+# The class, the encoding, the target, and whether it is bounded.
+KINDS = {
+    "isotropic": (LAYERED3, "layered3", "principled", False),
+    "stretched": (LAYERED3, "layered3", "stretched", False),
+    "bounded": (LAYERED3, "layered3", "stretched", True),
+    "single": (MEASURED, "direction", "measured", False),
+    "anisotropic": (MEASURED, "azimuth", "anisotropic", False),
+}
+ISOTROPIC = tuple(kind for kind in KINDS if kind != "anisotropic")
+IN_PLANE = ("stretched", "bounded", "single")
+AZIMUTHS = (0.0, 2.0, 4.5)
+# A bright stretched metal, and a paint with sheen: together they reflect more than they receive.
+BLEND = Blend(
+    (
+        Principled(Color(1.0, 0.9, 0.8), 0.5, 1.0, 0.5, 0.1, 0.1, 0.1, 0.3, 0.2, -4.0, 0.1, -0.1, 0.5),
+        Principled(Color(0.9, 0.9, 1.0), 0.9, 0.1, 1.0, 0.2, 0.9, 0.5, 0.5, 0.1, -2.0, 0.1, -0.1, 0.5),
+    ),
+    (0.6, 0.4),
+)
+
+
+@cache
+def adapter(kind):
+    """One whose blend moves about `BLEND` with all that the network sees."""
+    space, name, wanted, bounded = KINDS[kind]
+    raw = np.array(target.encode(BLEND, target.TARGETS[wanted]), np.float32)
+    slopes = np.random.default_rng(0).standard_normal((len(raw), encoding.size(name, space, True)))
+    layers = [(0.1 * slopes.astype(np.float32), raw)]
+    return Adapter(space, name, layers, 2, True, target.TARGETS[wanted], bounded=bounded)
+
+
+def columns(of, like):
+    """Parameters of one material, as wide as `like`."""
+    vector = LAYERED3.sample(np.random.default_rng(1), 1)[0] if of.space is LAYERED3 else []
+    return [0.0 * like + float(x) for x in vector]
+
+
+def prepared(kind, wi):
+    return adapter(kind).prepare(columns(adapter(kind), wi.z), wi)
+
+
+def turned(v, angle):
+    """About the normal."""
+    c, s = math.cos(angle), math.sin(angle)
+    return Vec3(c * v.x - s * v.y, s * v.x + c * v.y, v.z)
+
+
+def pairs(n=2000):
+    rng = np.random.default_rng(2)
+    return random_directions(rng, n), random_directions(rng, n)
+
+
+@pytest.mark.parametrize("azimuth", AZIMUTHS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_follow_the_density_in_the_local_frame(kind, azimuth):
+    """Chi-square at level .01, Sidak-corrected over all kinds and azimuths."""
+
+    def view(like):
+        wi = turned(Vec3(0.8, 0.0, 0.6), azimuth)
+        return Vec3(*(0.0 * like + x for x in wi))
+
+    def draw(u):
+        wi = view(u.x)
+        wo, _, pdf = prepared(kind, wi).sample(wi, u.x, u.y, u.z)
+        return mi.Vector3f(*wo), mi.Float(pdf > 0)
+
+    def density(wo):
+        wi = view(wo.x)
+        return prepared(kind, wi).pdf(wi, Vec3(wo.x, wo.y, wo.z))
+
+    sphere = mi.chi2.SphericalDomain()
+    test = mi.chi2.ChiSquareTest(sphere, draw, density, 3, sample_count=1 << 17, res=51, ires=16)
+    assert test.run(0.01, len(KINDS) * len(AZIMUTHS)), test.messages
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_methods_agree(kind):
+    wi, wo = pairs()
+    brdf = prepared(kind, wi)
+    value, pdf = brdf.eval_pdf(wi, wo)
+    np.testing.assert_array_equal(stacked(brdf.eval(wi, wo)), stacked(value))
+    np.testing.assert_array_equal(brdf.pdf(wi, wo), pdf)
+    drawn, value, pdf = brdf.sample(wi, *np.random.default_rng(3).random((3, 2000)))
+    again, density = brdf.eval_pdf(wi, drawn)
+    assert (pdf > 0).mean() > 0.7
+    np.testing.assert_allclose(stacked(again), stacked(value), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(density, pdf, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ISOTROPIC)
+def test_an_isotropic_material_looks_the_same_when_both_directions_turn(kind):
+    wi, wo = pairs()
+    expected = stacked(prepared(kind, wi).eval(wi, wo))
+    for azimuth in AZIMUTHS:
+        i, o = turned(wi, azimuth), turned(wo, azimuth)
+        np.testing.assert_allclose(stacked(prepared(kind, i).eval(i, o)), expected, rtol=1e-4, atol=1e-9)
+
+
+def off(found, expected):
+    """The mean difference, as a share of the mean."""
+    return np.abs(stacked(found) - stacked(expected)).mean() / stacked(expected).mean()
+
+
+@pytest.mark.parametrize("kind", IN_PLANE)
+def test_a_frame_that_is_forgotten_shows(kind):
+    """The error that callers made who took the blend alone, and which a `Brdf` makes impossible."""
+    wi, wo = pairs()
+    brdf = prepared(kind, wi)
+    assert off(target.eval(brdf.blend, wi, wo), brdf.eval(wi, wo)) > 0.4
+
+
+def test_an_anisotropic_material_shows_its_azimuth():
+    wi, wo = pairs()
+    i, o = turned(wi, 1.0), turned(wo, 1.0)
+    assert off(prepared("anisotropic", i).eval(i, o), prepared("anisotropic", wi).eval(wi, wo)) > 0.2
+
+
+def test_bounded_adapters_are_dimmed():
+    wi, wo = pairs()
+    bright = replace(adapter("bounded"), bounded=False).prepare(columns(adapter("bounded"), wi.z), wi)
+    dim = prepared("bounded", wi)
+    assert np.min(dim.blend.scale) < 0.95
+    np.testing.assert_allclose(
+        stacked(dim.eval(wi, wo)), stacked(bright.eval(wi, wo) * dim.blend.scale), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_what_stretches_in_the_plane_of_incidence_has_a_frame(kind):
+    """Others record no operation for it."""
+    assert isinstance(prepared(kind, pairs()[0]).plane, Plane if kind in IN_PLANE else type(None))
+
+
+@pytest.mark.parametrize("kind", ISOTROPIC)
+def test_curves_and_numbers_are_of_the_same_brdf(kind):
+    """The network's rounding, and interpolation between nodes."""
+    wi, wo = pairs()
+    own, expected = adapter(kind), prepared(kind, wi).eval(wi, wo)
+    flat = own.numbers(np.reshape([c[0] for c in columns(own, wi.z)], (1, -1)), wi.z)[0]
+    assert off(own.from_numbers(list(flat.T.astype(np.float64)), wi).eval(wi, wo), expected) < 1e-5
+    curves = Curves(own, columns(own, mi.Float(0.0)))
+    wi, wo = (Vec3(*(mi.Float(x.astype(np.float32)) for x in v)) for v in (wi, wo))
+    assert off(curves.at(wi, []).eval(wi, wo), expected) < 1e-3
+
+
+def test_an_anisotropic_adapter_has_no_curves():
+    own = adapter("anisotropic")
+    for call in (lambda: own.numbers(np.zeros((1, 0)), [0.5]), lambda: Curves(own, [])):
+        with pytest.raises(ParamError, match="no curves over cos.*call `prepare` with whole directions"):
+            call()
