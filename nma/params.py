@@ -3,17 +3,55 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nma import ops
 from nma.data import load_conductors
 from nma.errors import ParamError
 
 Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
 Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
-Bounds = Literal["training", "valid"]
+Range = Literal["training", "valid"]
+
+# How far beyond a bound a number may lie, in the unit of the parameter or, if that is less, of its range. Textures, and
+# renderers in other languages, keep numbers in single precision: that moves the bounds of our classes by up to 2.4e-7.
+ROUNDING = 1e-6
+# What to do about a number beyond a range.
+_ADVICE = {
+    "training": ", the range that the adapter was trained on; set `clamp` to move it there",
+    "valid": "; take a value in between",
+}
+
+
+class Bounds(NamedTuple):
+    """The numbers from `low` to `high`: which they are, and what to say of others. All that is checked is checked here.
+
+    Numbers are arrays of NumPy or Dr.Jit. The bounds may be arrays, too, one number per column.
+    """
+
+    low: Any
+    high: Any
+
+    def bad(self, x: Any, clamp: bool = False) -> Any:
+        """Which numbers are refused: all beyond by more than rounding or, as `clamp` moves these, NaN and infinity."""
+        finite = abs(x) < np.inf
+        if clamp:
+            return ~finite
+        slack = ROUNDING * ops.minimum(self.high - self.low, 1.0)
+        return ~(finite & (x >= self.low - slack) & (x <= self.high + slack))
+
+    def moved(self, x: Any) -> Any:
+        """The nearest numbers within; the lower bound for NaN. On a bound the derivative is 1: values may come back."""
+        return ops.select(x >= self.low, ops.select(x <= self.high, x, self.high), self.low)
+
+    def refusal(self, name: str, found: ArrayLike, kind: Range = "valid") -> str:
+        """What to say of a bad value: of a number, or of a triple, which is shortened where it is grey."""
+        numbers = [f"{x:.7g}" for x in np.ravel(np.asarray(found, np.float64))]
+        shown = ", ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
+        return f"{name} is {shown}, allowed is {self.low:g} .. {self.high:g}{_ADVICE[kind]}"
 
 
 @dataclass(frozen=True)
@@ -38,8 +76,6 @@ class Param:
     def normalise(self, x):
         """Maps the training range to [0, 1]: linearly, or by the logarithm where the law is logarithmic."""
         if self.law == "log10":
-            from nma import ops
-
             span = np.log(self.high / self.low)
             return ops.log(x / self.low) * float(1.0 / span)
         return (x - self.low) / (self.high - self.low)
@@ -53,8 +89,8 @@ class Param:
             return 1.0 - u * u
         return self.low + u * (self.high - self.low)
 
-    def bounds(self, kind: Bounds) -> tuple[float, float]:
-        return (self.low, self.high) if kind == "training" else (self.valid_low, self.valid_high)
+    def bounds(self, kind: Range) -> Bounds:
+        return Bounds(*((self.low, self.high) if kind == "training" else (self.valid_low, self.valid_high)))
 
 
 @dataclass(frozen=True)
@@ -108,7 +144,7 @@ class ParamSpace:
             out[columns] = value
         return out
 
-    def check(self, params: ArrayLike, bounds: Bounds = "valid", clamp: bool = False) -> NDArray[np.float64]:
+    def check(self, params: ArrayLike, bounds: Range = "valid", clamp: bool = False) -> NDArray[np.float64]:
         """Returns `params` as float64 (n, size) within the bounds, or raises `ParamError` that names the first fault.
 
         Values beyond a bound by no more than a rounding error are moved to it; with `clamp` all are, but what is not
@@ -120,28 +156,15 @@ class ParamSpace:
                 f"parameters of class {self.name} have shape (n, {self.size}), got {np.shape(params)}"
             )
         for param in self.params:
-            columns = self.slices[param.name]
-            low, high = param.bounds(bounds)
-            values = p[:, columns]
-            tolerance = 1e-6 * min(high - low, 10.0)
-            bad = ~np.isfinite(values)
-            if not clamp:
-                bad |= (values < low - tolerance) | (values > high + tolerance)
+            values, allowed = p[:, self.slices[param.name]], param.bounds(bounds)
+            bad = allowed.bad(values, clamp).any(axis=1)
             if bad.any():
-                row = int(np.nonzero(bad.any(axis=1))[0][0])
-                where = f" of material {row}" if len(p) > 1 else ""
-                found = ", ".join(f"{x:.9g}" for x in values[row])
-                hint = (
-                    f"; an adapter only knows its {bounds} range, clamp to it if that is meant"
-                    if bounds == "training"
-                    else ""
-                )
-                raise ParamError(
-                    f"{param.name} ({param.symbol}){where} is {found}, allowed is {low:g} .. {high:g}{hint}"
-                )
-        return np.clip(p, *self.columns(bounds))
+                row = int(np.argmax(bad))
+                where = f"material {row}: " if len(p) > 1 else ""
+                raise ParamError(where + allowed.refusal(param.name, values[row], bounds))
+        return Bounds(*self.columns(bounds)).moved(p)
 
-    def columns(self, bounds: Bounds) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def columns(self, bounds: Range) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper bound of every column."""
         pairs = np.array([p.bounds(bounds) for p in self.params for _ in range(p.size)]).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]

@@ -293,7 +293,7 @@ def test_wrong_edits_are_refused(weights):
     pixels = np.full((4, 8, 3), 0.5, np.float32)
     pixels[2, 5, 1] = np.nan
     params["albedo.data"] = mi.TensorXf(pixels)
-    with pytest.raises(Exception, match="texture of albedo holds nan at x=5, y=2"):
+    with pytest.raises(Exception, match="texture of albedo at x=5, y=2: albedo is 0.5, nan, 0.5"):
         params.update()
 
 
@@ -332,9 +332,12 @@ def texture(value, channels=1):
         ({"alpha_top": 0.9}, "set `clamp` to move it there"),
         ({"eta_conductor": rgb([0.1, 9.0, 1.0])}, "eta_conductor is 0.1, 9, 1, allowed is 0.03 .. 7.6"),
         ({"alpha_top": float("nan"), "clamp": True}, "alpha_top is nan"),
-        ({"alpha_bottom": texture(np.nan)}, "texture of alpha_bottom holds nan at x=5, y=2"),
-        ({"alpha_bottom": texture(np.nan), "clamp": True}, "texture of alpha_bottom holds nan at x=5, y=2"),
-        ({"sigma_t": texture(1.5)}, "texture of sigma_t holds 1.5 at x=5, y=2"),
+        ({"alpha_bottom": texture(np.nan)}, "texture of alpha_bottom at x=5, y=2: alpha_bottom is nan"),
+        (
+            {"alpha_bottom": texture(np.nan), "clamp": True},
+            "texture of alpha_bottom at x=5, y=2: alpha_bottom is nan",
+        ),
+        ({"sigma_t": texture(1.5)}, "texture of sigma_t at x=5, y=2: sigma_t is 1.5"),
         ({"material": "unobtainium"}, "unobtainium"),
         ({"roughness": 0.3}, "roughness"),
         ({"adapter": "layered9-1x1"}, "layered9-1x1"),

@@ -212,7 +212,7 @@ WRONG = {
         {"albedo": bitmap_texture(np.full((2, 2, 3), 0.5))},
         "albedo.data",
         None,
-        "albedo holds 3.0 at x=1, y=0",
+        "albedo at x=1, y=0: albedo is 3, allowed is 0 .. 1",
     ),
 }
 

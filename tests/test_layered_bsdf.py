@@ -133,10 +133,10 @@ def texture(value, channels=1):
         ({"alpha_top": "rough"}, "alpha_top wants a number"),
         ({"alpha_top": 1.0, "roughness": 0.1}, "roughness"),
         ({"material": "unobtainium"}, "unobtainium"),
-        ({"alpha_bottom": texture(np.nan)}, "texture of alpha_bottom holds nan at x=5, y=2"),
-        ({"alpha_bottom": texture(3.0)}, "texture of alpha_bottom holds 3.0 at x=5, y=2"),
+        ({"alpha_bottom": texture(np.nan)}, "texture of alpha_bottom at x=5, y=2: alpha_bottom is nan"),
+        ({"alpha_bottom": texture(3.0)}, "texture of alpha_bottom at x=5, y=2: alpha_bottom is 3"),
         ({"alpha_bottom": texture([0.1, 0.2, 0.3], 3)}, "texture of alpha_bottom is coloured"),
-        ({"k_conductor": texture(-1.0, 3)}, "texture of k_conductor holds -1.0 at x=5, y=2"),
+        ({"k_conductor": texture(-1.0, 3)}, "texture of k_conductor at x=5, y=2: k_conductor is -1"),
     ),
 )
 def test_wrong_inputs_are_refused(changes, message):

@@ -72,14 +72,14 @@ def test_a_conductor_may_be_given_by_its_index(material_file):
 
 @pytest.mark.parametrize("given", ["sigma_t = 1001", "sigma_t = 1e30", "sigma_t = 1e300"])
 def test_a_medium_through_which_walks_would_not_end_is_refused(material_file, given):
-    with pytest.raises(MaterialError, match=r"sigma_t .* allowed is 0 \.\. 1000"):
+    with pytest.raises(MaterialError, match=r"sigma_t is .* allowed is 0 \.\. 1000"):
         materials.load(material_file("sigma_t = 0.25", given))
     assert materials.load(material_file("sigma_t = 0.25", "sigma_t = 1000")).vector()[-1] == 1000
 
 
 def test_a_metal_whose_reflectance_overflows_is_refused(material_file):
     """From an index of about 1e10 on, single precision made it black."""
-    with pytest.raises(MaterialError, match=r"k_conductor .* allowed is 0 \.\. 10000"):
+    with pytest.raises(MaterialError, match=r"k_conductor is .* allowed is 0 \.\. 10000"):
         materials.load(material_file('conductor = "Au"', "eta_conductor = 1\nk_conductor = 1e10"))
     largest = materials.load(material_file('conductor = "Au"', "eta_conductor = 1e4\nk_conductor = 1e4"))
     reflectance = fresnel_conductor(np.float32(0.5), *(np.float32(x) for x in largest.vector()[[3, 6]]))
@@ -103,12 +103,12 @@ def test_sources_take_what_adapters_do_not_know(material_file):
         ('"Au"', '"au"', r"did you mean 'Au'\?"),
         ("albedo", "k_conductor = 1\nalbedo", "either conductor or k_conductor"),
         ("albedo = 0.5", "albedo = [1, 2]", "must be a number or a list of 3"),
-        ("albedo = 0.5", "albedo = 1.5", r"albedo .* allowed is 0 \.\. 1"),
-        ("alpha_top = 0.1", "alpha_top = nan", r"alpha_top .* is nan, allowed"),
+        ("albedo = 0.5", "albedo = 1.5", r"albedo is 1.5, allowed is 0 \.\. 1"),
+        ("alpha_top = 0.1", "alpha_top = nan", r"alpha_top is nan, allowed"),
         ("alpha_top = 0.1", "alpha_top = true", "alpha_top is True, but must be a number"),
         ("alpha_top = 0.1", "alpha_top =", "is no TOML file"),
         ("alpha_top = 0.1", "alpha_top = .1", "is no TOML file.*line.*; numbers begin with a digit, 0.05"),
-        ("alpha_top = 0.1", "alpha_top = 2", r"alpha_top \(alpha_1\) is 2, allowed"),
+        ("alpha_top = 0.1", "alpha_top = 2", r"alpha_top is 2, allowed"),
         ("albedo = 0.5", "albedo = { texture = 'none.png' }", "there is no texture .*none.png"),
         ("albedo = 0.5", "albedo = { texture = 'x', gain = 2 }", "unknown key 'gain'"),
         ("albedo = 0.5", "albedo = { scale = 2 }", "texture must be a file name"),
@@ -118,11 +118,11 @@ def test_sources_take_what_adapters_do_not_know(material_file):
         ('"Au"', "['Au']", r"no conductor \['Au'\]"),
         ("[parameters]", "parameters = 1\n[more]", "unknown key 'more'"),
         ("alpha_top = 0.1", "alpha_top = { width = 1 }", "unknown key 'width'"),
-        ("alpha_top = 0.1", f"alpha_top = 1{'0' * 400}", r"alpha_top .* is inf, allowed"),
-        ("alpha_top = 0.1", f"alpha_top = -1{'0' * 400}", r"alpha_top .* is -inf, allowed"),
+        ("alpha_top = 0.1", f"alpha_top = 1{'0' * 400}", r"alpha_top is inf, allowed"),
+        ("alpha_top = 0.1", f"alpha_top = -1{'0' * 400}", r"alpha_top is -inf, allowed"),
         ("alpha_top = 0.1", f"alpha_top = 1{'0' * 9000}", "is no TOML file: Exceeds the limit"),
         ("alpha_top = 0.1", f"alpha_top = [0x{'f' * 9000}, 1]", "too many digits, but must be a number"),
-        ("alpha_top = 0.1", "alpha_top = inf", r"alpha_top .* is inf, allowed"),
+        ("alpha_top = 0.1", "alpha_top = inf", r"alpha_top is inf, allowed"),
         ("alpha_top = 0.1", "alpha_top = 1979-05-27", "must be a number"),
         ("alpha_top = 0.1", f"alpha_top = {'[' * 9000}{']' * 9000}", "nest too deep"),
         ("alpha_top = 0.1", f"alpha_top{'.a' * 2000} = 1", "unknown key 'a'"),

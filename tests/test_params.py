@@ -217,7 +217,7 @@ def test_what_lies_beyond_a_bound_is_refused_with_name_row_and_range(bounds, nam
     with pytest.raises(ParamError) as caught:
         LAYERED3.check(vectors, bounds)
     message = str(caught.value)
-    assert message.startswith(f"{name} ({param.symbol}) of material 2 is ")
+    assert message.startswith(f"material 2: {name} is ")
     assert f"allowed is {low} .. {high}" in message
     assert ("clamp" in message) == (bounds == "training")
     assert "\n" not in message
@@ -242,7 +242,7 @@ def test_what_is_not_finite_is_refused_even_where_clamped(value, clamp):
     vectors = draw("mixed", 3)
     vectors[1, 12] = value
     for bounds in ("training", "valid"):
-        with pytest.raises(ParamError, match=r"sigma_t \(sigma_t\) of material 1"):
+        with pytest.raises(ParamError, match="material 1: sigma_t is "):
             LAYERED3.check(vectors, bounds, clamp=clamp)
 
 

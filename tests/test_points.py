@@ -188,7 +188,7 @@ def test_a_coat_reflects_above_its_metal():
     ("wrong", "text"),
     (
         ({"conductor": "Xx"}, "no conductor 'Xx'"),
-        ({"alpha": 0.0}, "alpha is 0.0, allowed is 0.0001 .. 1"),
+        ({"alpha": 0.0}, "alpha is 0, allowed is 0.0001 .. 1"),
         ({"eta": 1.0}, "eta must be above 1"),
         ({"absorption": (-1.0, 0.0, 0.0)}, "absorption at least 0"),
     ),

@@ -264,7 +264,7 @@ def test_parameters_beyond_the_training_range_are_refused_or_moved():
     for column, value in ((0, 0.5), (2, -np.inf), (9, np.nan), (12, 1.01)):
         beyond = params.copy()
         beyond[7, column] = value
-        wanted = f"{loaded.names[column]} of row 7 is {value:g}, the adapter was trained on {low[column]:g} "
+        wanted = f"row 7: {loaded.names[column]} is {value:g}, allowed is {low[column]:g} "
         with pytest.raises(nma.errors.ParamError, match=re.escape(wanted)):
             loaded.prepare(beyond, cosines)
         assert loaded._library.nma_check(loaded._handle, pointer(beyond[7])) == column
@@ -275,7 +275,7 @@ def test_parameters_beyond_the_training_range_are_refused_or_moved():
             np.testing.assert_array_equal(found, loaded.outputs(moved, cosines))
         loaded._library.nma_clamp(loaded._handle, pointer(beyond[7]))
         np.testing.assert_array_equal(beyond, moved)
-    with pytest.raises(nma.errors.ParamError, match="albedo of row 0 is nan"):
+    with pytest.raises(nma.errors.ParamError, match="row 0: albedo is nan"):
         loaded.prepare(params * np.where(np.arange(13) == 9, np.nan, 1), cosines, clamp=True)
     assert loaded._library.nma_check(loaded._handle, pointer(params[0])) == -1
 

@@ -230,7 +230,7 @@ def test_what_cannot_be_tabulated_is_refused():
         tabulate(Lambert(), params, 0, stream_keys(0, [0]))
     with pytest.raises(TableError, match="2 key"):
         tabulate(Lambert(), params, 40, stream_keys(0, range(2)))
-    with pytest.raises(ParamError, match=r"rho.*is 1\.5, 1\.5, 1\.5, allowed is 0 \.\. 1"):
+    with pytest.raises(ParamError, match=r"rho is 1\.5, allowed is 0 \.\. 1"):
         tabulate(Lambert(), params + 1.0, 40, stream_keys(0, [0]))
 
 

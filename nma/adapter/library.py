@@ -63,7 +63,7 @@ class Library:
             )
         try:
             library = Library(adapter, tuple(names), codes)
-            LIBRARY.check(codes, "training")
+            LIBRARY.check(codes)
         except (WeightsError, ParamError) as e:
             raise WeightsError(f"{path}: {e}; copy or train it again") from None
         return library
@@ -100,7 +100,7 @@ class Library:
 
     def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
         """One material as an adapter of its own that sees the direction alone: its code becomes part of the biases."""
-        code = LIBRARY.check(code, "training")
+        code = LIBRARY.check(code)
         if len(code) != 1:
             raise ParamError(f"one code makes one material; got {len(code)}")
         (matrix, bias), *rest = self.adapter.layers
@@ -122,5 +122,5 @@ class Library:
         """A library with one material more. Raises `ParamError` if it has one of that name."""
         if name in self.names:
             raise ParamError(f"the library has a material '{name}'; choose another name")
-        codes = np.concatenate([self.codes, LIBRARY.check(code, "training").astype(np.float32)])
+        codes = np.concatenate([self.codes, LIBRARY.check(code).astype(np.float32)])
         return replace(self, names=(*self.names, name), codes=codes)

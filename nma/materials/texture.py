@@ -45,16 +45,12 @@ class Texture:
         """
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
             values = self._pixels() * np.float32(self.scale) + np.float32(self.offset)
-        low, high = self.parameter.bounds("valid")
-        slack = 1e-6  # single precision
-        bad = ~((values >= low - slack) & (values <= high + slack)) | ~np.isfinite(values)
+        allowed = self.parameter.bounds("valid")
+        bad = allowed.bad(values)
         if bad.any():
-            row, column, channel = np.argwhere(bad)[0]
-            raise TextureError(
-                f"{self.path}: {bad.sum()} of {bad.size} values are not allowed for {self.parameter.name} "
-                f"({low:g} .. {high:g}), the first is {values[row, column, channel]} at x={column}, y={row}"
-            )
-        return np.clip(values, low, high)
+            pixel, place = first_pixel(values, bad)
+            raise TextureError(f"{self.path}{place}: {allowed.refusal(self.parameter.name, pixel)}")
+        return allowed.moved(values)
 
     def _pixels(self) -> NDArray[np.float32]:
         """The image (height, width, size), linear unless `raw`, grey where `size` is 1."""
@@ -85,6 +81,16 @@ class Texture:
         if self.channel == "a":
             return formats.RGBA
         return formats.Y if self.parameter.size == 1 and own in (formats.Y, formats.YA) else formats.RGB
+
+
+def first_pixel(pixels: NDArray, bad: NDArray[np.bool_]) -> tuple[NDArray, str]:
+    """The first pixel (channels,) of an image (height, width, channels) with bad values, and in words where it is."""
+    row, column, _ = np.argwhere(bad)[0]
+    if bad.shape[:2] == (1, 1):
+        return pixels[0, 0], ""
+    count = bad.any(axis=-1).sum()
+    more = f", the first of {count} such pixels" if count > 1 else ""
+    return pixels[row, column], f" at x={column}, y={row}{more}"
 
 
 def _converted(bitmap: Any, pixel_format: Any) -> NDArray[np.float32]:

@@ -23,6 +23,7 @@ from nma.adapter import weights_file
 from nma.adapter.adapter import SAME
 from nma.errors import ParamError, WeightsError
 from nma.native import build
+from nma.params import Bounds
 
 Array = NDArray[np.float32]
 # As nma_c.h numbers them.
@@ -156,15 +157,13 @@ class Runtime:
                     f"material, whose own is {self.material[column]:g}; fit one to that material"
                 )
             return rows
-        slack = 1e-6 * np.maximum(np.abs(self.low), 1.0)
-        inside = np.isfinite(rows) if clamp else (rows >= self.low - slack) & (rows <= self.high + slack)
-        if not inside.all():
-            row, column = np.argwhere(~inside)[0]
-            raise ParamError(
-                f"{self.names[column]} of row {row} is {rows[row, column]:g}, the adapter was trained on "
-                f"{self.low[column]:g} .. {self.high[column]:g}; `clamp` moves finite numbers there"
-            )
-        return np.clip(rows, self.low, self.high) if clamp else rows
+        allowed = Bounds(self.low, self.high)
+        bad = allowed.bad(rows, clamp)
+        if bad.any():
+            row, column = np.argwhere(bad)[0]
+            one = Bounds(self.low[column], self.high[column])
+            raise ParamError(f"row {row}: {one.refusal(self.names[column], rows[row, column], 'training')}")
+        return allowed.moved(rows) if clamp else rows
 
     def _many(self, name: str, rows: Array, wi: ArrayLike, width: int) -> Array:
         views = self._views(wi)

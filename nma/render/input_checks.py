@@ -8,29 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.errors import ParamError, TextureError
-from nma.params import Bounds, Param
+from nma.materials.texture import first_pixel
+from nma.params import Param, Range
 
 CHANNELS = ("r", "g", "b")
 
 
 class Allowed(NamedTuple):
-    """What a parameter may be: within its `bounds`, or with `clamp` anything finite."""
+    """What a parameter may be: within a range of its own, or with `clamp` anything finite."""
 
     param: Param
-    bounds: Bounds
+    range: Range
     clamp: bool
 
     def bad(self, numbers: NDArray) -> NDArray[np.bool_]:
-        """Which numbers are not allowed; a rounding error beyond a bound is."""
-        low, high = self.param.bounds(self.bounds)
-        slack = 1e-6 * max(abs(low), 1.0)
-        inside = (numbers >= low - slack) & (numbers <= high + slack)
-        return ~np.isfinite(numbers) | (~inside & (not self.clamp))
+        return self.param.bounds(self.range).bad(numbers, self.clamp)
 
-    def __str__(self) -> str:
-        low, high = self.param.bounds(self.bounds)
-        trained = ", the range that the adapter was trained on; set `clamp` to move it there"
-        return f"allowed is {low:g} .. {high:g}" + (trained if self.bounds == "training" else "")
+    def refusal(self, found: NDArray) -> str:
+        return self.param.bounds(self.range).refusal(self.param.name, found, self.range)
 
 
 def check_numbers(allowed: Allowed, value: Any) -> None:
@@ -40,7 +35,7 @@ def check_numbers(allowed: Allowed, value: Any) -> None:
     if numbers.size not in (1, size):
         raise ParamError(f"{name} wants {size} number(s), got {numbers.size}")
     if allowed.bad(numbers).any():
-        raise ParamError(f"{name} is {', '.join(f'{x:g}' for x in numbers)}, {allowed}")
+        raise ParamError(allowed.refusal(numbers))
 
 
 def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: int | None) -> None:
@@ -94,8 +89,5 @@ def _check_pixels(allowed: Allowed, pixels: NDArray, where: str, channel: int | 
         )
     bad = allowed.bad(pixels)
     if bad.any():
-        first = tuple(np.argwhere(bad)[0])
-        place = f" at x={first[1]}, y={first[0]}" if pixels.shape[:2] != (1, 1) else ""
-        raise TextureError(
-            f"{where} holds {pixels[first]}{place}, one of {bad.sum()} such values of {bad.size}; {allowed}"
-        )
+        pixel, place = first_pixel(pixels, bad)
+        raise TextureError(f"{where}{place}: {allowed.refusal(pixel)}")

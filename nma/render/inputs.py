@@ -9,8 +9,7 @@ import numpy as np
 from nma import materials
 from nma.adapter import Adapter
 from nma.errors import ParamError, TextureError
-from nma.ops import Float, select
-from nma.params import MEASURED, Bounds, Param, ParamSpace
+from nma.params import MEASURED, Param, ParamSpace, Range
 from nma.render.input_checks import CHANNELS, Allowed, check_numbers, check_texture
 from nma.render.textures import bitmap_texture
 
@@ -33,7 +32,7 @@ class Inputs:
     # Frozen functions of Dr.Jit look for variables here.
     DRJIT_STRUCT = {"values": dict}  # noqa: RUF012
 
-    def __init__(self, space: ParamSpace, props: Any, bounds: Bounds = "valid", clamp: bool = False):
+    def __init__(self, space: ParamSpace, props: Any, bounds: Range = "valid", clamp: bool = False):
         self.space, self.bounds, self.clamp = space, bounds, clamp
         given: dict[str, Any] = {}
         if "material" in props:
@@ -75,7 +74,7 @@ class Inputs:
             channels = channels if param.size == 3 else [channels[self.chosen[name] or 0]]
         else:
             channels = [value] if param.size == 1 else [value.x, value.y, value.z]
-        return [_within(c, *param.bounds(self.bounds)) for c in channels]
+        return [param.bounds(self.bounds).moved(c) for c in channels]
 
     def traverse(self, callback: Any, flags: Any = None) -> None:
         """Shows every input to `mi.traverse` under its name; differentiable unless `flags` say otherwise."""
@@ -213,12 +212,6 @@ def _indices(values: list[Any]) -> list[int]:
     import drjit as dr
 
     return [index & 0xFFFFFFFF for index in dr.detail.collect_indices(values)]
-
-
-def _within(x: Float, low: float, high: float) -> Float:
-    """`x` moved within the bounds, NaN to the lower one. On a bound the derivative is 1: values may come back."""
-    high = min(high, 1e30)
-    return select(x >= low, select(x <= high, x, high), low)
 
 
 def _value(param: Param, given: Any) -> Any:

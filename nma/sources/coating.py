@@ -17,6 +17,9 @@ from nma.data import load_conductors
 from nma.errors import ParamError
 from nma.microfacet import fresnel_conductor_rgb, fresnel_dielectric, ggx_d, smith_g1
 from nma.ops import Color, Float, Vec3
+from nma.params import LAYERED3
+
+_WIDTHS = LAYERED3["alpha_top"].bounds("valid")
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,8 @@ class Coating:
         if self.conductor not in load_conductors().names:
             raise ParamError(f"coating: there is no conductor '{self.conductor}'; try `Cu`, `Au` or `Al`")
         for what in ("alpha", "alpha_metal"):
-            if not 1e-4 <= getattr(self, what) <= 1:
-                raise ParamError(f"coating: {what} is {getattr(self, what)}, allowed is 0.0001 .. 1")
+            if _WIDTHS.bad(np.float64(getattr(self, what))):
+                raise ParamError(f"coating: {_WIDTHS.refusal(what, getattr(self, what))}")
         if not self.eta > 1 or not all(0 <= a < np.inf for a in self.absorption):
             raise ParamError(
                 f"coating: eta must be above 1 and absorption at least 0, got {self.eta} and {self.absorption}"

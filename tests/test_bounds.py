@@ -1,0 +1,205 @@
+"""What a parameter may be is the same wherever it is given: one check, one tolerance, one sentence."""
+
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from adapter_cases import random_adapter
+from material_cases import write_image
+
+import nma.render
+from nma import materials
+from nma.errors import NmaError
+from nma.native.runtime import Runtime
+from nma.params import LAYERED3, ROUNDING, SPACES, Bounds
+from nma.render.textures import bitmap_texture
+
+nma.render.use("llvm_ad_rgb")
+
+PLAIN = {"alpha_top": 0.1, "alpha_bottom": 0.2, "eta_top": 1.5, "eta_conductor": 1.0, "k_conductor": 3.0}
+PLAIN |= {"albedo": 0.5, "sigma_t": 0.25}
+NAMES = ("alpha_top", "eta_top", "albedo", "sigma_t")
+INFINITE = [float("nan"), float("inf"), -float("inf")]
+
+
+@pytest.fixture(scope="module")
+def adapter(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    random_adapter(hidden="1x8").save(path)
+    return path
+
+
+def pixels(name, value):
+    """An image of good pixels but for one."""
+    image = np.full((3, 4, LAYERED3[name].size), PLAIN[name], np.float32)
+    image[1, 2] = value
+    return image
+
+
+def text(value):
+    return str(value).replace("(", "[").replace(")", "]")
+
+
+class Entries:
+    """All ways to give a parameter, each a function of its name and value, which raises where it is refused."""
+
+    def __init__(self, folder, adapter, material_file, command):
+        self.folder, self.adapter, self.material_file, self.command = folder, adapter, material_file, command
+
+    def vector(self, name, value):
+        LAYERED3.check(LAYERED3.vector(PLAIN | {name: value}))
+
+    def number_of_a_file(self, name, value):
+        materials.load(self.material_file(f"{name} = {PLAIN[name]}", f"{name} = {text(value)}"))
+
+    def texture_of_a_file(self, name, value):
+        write_image(self.folder / "image.exr", pixels(name, value))
+        given = f"{name} = {{ texture = 'image.exr' }}"
+        materials.load(self.material_file(f"{name} = {PLAIN[name]}", given)).values[name].read()
+
+    def command_line(self, name, value):
+        material = self.material_file()
+        given = ",".join(map(str, np.ravel(value)))
+        status, _, said = self.command("render", material, "--set", f"{name}={given}", "--mesh", "none.ply")
+        # Were the value allowed, the command would miss the mesh next.
+        if status and "none.ply" not in said:
+            raise NmaError(" ".join(said.split()))
+
+    def number_of_a_scene(self, name, value):
+        load({name: property_of(value)})
+
+    def texture_of_a_scene(self, name, value):
+        load({name: bitmap_texture(pixels(name, value))})
+
+    def edit_of_a_number(self, name, value):
+        edit(load({}), name, type_of(name)(value))
+
+    def edit_of_a_texture(self, name, value):
+        edit(
+            load({name: bitmap_texture(pixels(name, PLAIN[name]))}),
+            f"{name}.data",
+            mi.TensorXf(pixels(name, value)),
+        )
+
+
+class TrainedEntries(Entries):
+    """Those that an adapter's training range holds for."""
+
+    def vector(self, name, value):
+        nma.Adapter.load(self.adapter).check(LAYERED3.vector(PLAIN | {name: value}))
+
+    def batch(self, name, value):
+        row = LAYERED3.vector(PLAIN | {name: value})[None].astype(np.float32)
+        Runtime(self.adapter).prepare(row, np.ones(1, np.float32))
+
+    def number_of_a_scene(self, name, value):
+        load({name: property_of(value)}, type="nma", adapter=str(self.adapter))
+
+    def texture_of_a_scene(self, name, value):
+        load({name: bitmap_texture(pixels(name, value))}, type="nma", adapter=str(self.adapter))
+
+    def edit_of_a_number(self, name, value):
+        edit(load({}, type="nma", adapter=str(self.adapter)), name, type_of(name)(value))
+
+
+def load(changes, **settings):
+    given = {name: property_of(value) for name, value in PLAIN.items()}
+    return mi.load_dict({"type": "layered"} | given | settings | changes)
+
+
+def property_of(value):
+    return {"type": "rgb", "value": list(value)} if isinstance(value, tuple) else value
+
+
+def type_of(name):
+    return mi.Float if LAYERED3[name].size == 1 else mi.Color3f
+
+
+def edit(bsdf, name, value):
+    params = mi.traverse(bsdf)
+    params[name] = value
+    params.update()
+
+
+VALID = [way for way in vars(Entries) if not way.startswith("_")]
+TRAINED = [way for way in vars(TrainedEntries) if not way.startswith("_")]
+WAYS = [("valid", way) for way in VALID] + [("training", way) for way in TRAINED]
+
+
+@pytest.fixture
+def give(tmp_path, adapter, material_file, nma):
+    def way(kind, name):
+        entries = Entries if kind == "valid" else TrainedEntries
+        return getattr(entries(tmp_path, adapter, material_file, nma), name)
+
+    return way
+
+
+def beyond(kind, steps):
+    """Name and value of all parameters, `steps` tolerances beyond either bound; one channel of a triple."""
+    for name in NAMES:
+        low, high = LAYERED3[name].bounds(kind)
+        slack = steps * ROUNDING * min(high - low, 1.0)
+        for value in (low - slack, high + slack):
+            # Bounds at which single precision rounds by more than the tolerance take larger steps.
+            if float(np.float32(value)) != float(np.float32(low if value < low else high)):
+                yield name, value if LAYERED3[name].size == 1 else (PLAIN[name], value, PLAIN[name])
+
+
+def wrong(kind):
+    yield from beyond(kind, 3)
+    for value in INFINITE:
+        yield "alpha_top", value
+        yield "albedo", (0.5, value, 0.25)
+
+
+@pytest.mark.parametrize(("kind", "way"), WAYS)
+def test_a_wrong_value_is_refused_in_one_sentence_wherever_it_is_given(give, kind, way):
+    for name, value in wrong(kind):
+        with pytest.raises((NmaError, RuntimeError)) as error:
+            give(kind, way)(name, value)
+        found = value[1] if way == "batch" and isinstance(value, tuple) else value
+        said = LAYERED3[name].bounds(kind).refusal(name, np.float32(found), kind)
+        assert number_free(said) in number_free(" ".join(str(error.value).split())), (name, value)
+
+
+def number_free(message):
+    """Without digits that single precision makes up, as in 1.000003."""
+    return re.sub(r"(\d\.\d{5})\d+", r"\1", message)
+
+
+@pytest.mark.parametrize(("kind", "way"), WAYS)
+def test_a_rounding_error_is_allowed_wherever_it_is_given(give, kind, way):
+    for name, value in beyond(kind, 0.5):
+        give(kind, way)(name, value)
+
+
+@pytest.mark.parametrize("kind", ("training", "valid"))
+@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+def test_single_precision_keeps_bounds_within_the_tolerance(space, kind):
+    for param in space.params:
+        bounds = param.bounds(kind)
+        ends = np.array(bounds, np.float32)
+        assert not bounds.bad(ends).any() and not bounds.bad(ends.astype(np.float64)).any()
+
+
+def test_numpy_and_drjit_agree_on_what_is_bad_and_where_it_is_moved():
+    bounds = Bounds(0.001, 0.5)
+    x = np.array([0.0, 0.001, 0.25, 0.5, 0.6, *INFINITE], np.float32)
+    lanes = mi.Float(x)
+    for clamp in (False, True):
+        np.testing.assert_array_equal(bounds.bad(x, clamp), bounds.bad(lanes, clamp).numpy())
+    assert bounds.bad(x).tolist() == [True, False, False, False, True, True, True, True]
+    assert bounds.bad(x, clamp=True).tolist() == [False] * 5 + [True] * 3
+    np.testing.assert_array_equal(bounds.moved(x), bounds.moved(lanes).numpy())
+    moved = [0.001, 0.001, 0.25, 0.5, 0.5, 0.001, 0.5, 0.001]
+    np.testing.assert_allclose(bounds.moved(x), moved)
+
+
+def test_the_derivative_on_a_bound_is_1_so_that_values_come_back():
+    x = mi.Float([-1.0, 0.0, 0.5, 1.0, 2.0])
+    dr.enable_grad(x)
+    dr.backward(Bounds(0.0, 1.0).moved(x))
+    np.testing.assert_array_equal(x.grad.numpy(), [0, 1, 1, 1, 0])
