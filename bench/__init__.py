@@ -1,1 +1,1 @@
-"""Benches: how long things take, and what a frame is worth."""
+"""Benches: they measure how long things take, and how good a frame is for its time."""

@@ -1,9 +1,9 @@
 """Lists the benches, or runs them one after the other.
 
-python -m bench                                         what there is
+python -m bench                                         list all benches
 python -m bench all [--quick] [--output FOLDER]         run all of them
-python -m bench NAME ... [--quick] [--output FOLDER]    run some
-python -m bench.NAME --help                             what one of them takes
+python -m bench NAME ... [--quick] [--output FOLDER]    run some of them
+python -m bench.NAME --help                             show the options of one bench
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-# What only prints, and how it is quick.
+# Benches that only print and write no files, with their options for a quick run.
 PRINTING = {"training": ["--steps", "60"], "walks": ["--walks", "81920", "--repeat", "1"]}
 
 
 def benches() -> dict[str, Path]:
-    """Name and script of every bench: the files here that can be run."""
+    """Name and script of every bench. A bench is a file in this folder that can be run."""
     scripts = sorted(HERE.glob("*.py"))
     return {s.stem: s for s in scripts if s != Path(__file__) and "__main__" in s.read_text()}
 
@@ -30,7 +30,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME")
-    parser.add_argument("--quick", action="store_true", help="small and few, to see that they run")
+    parser.add_argument(
+        "--quick", action="store_true", help="small, short runs, to see that the benches work"
+    )
     parser.add_argument("--output", type=Path, help="folder of the results")
     arguments = parser.parse_args()
     known = benches()
@@ -40,7 +42,7 @@ def main() -> None:
         return
     unknown = set(arguments.names) - {"all", *known}
     if unknown:
-        sys.exit(f"no bench {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+        sys.exit(f"no bench {', '.join(sorted(unknown))}; the benches are {', '.join(known)}")
     if arguments.output:
         arguments.output.mkdir(parents=True, exist_ok=True)
     for name in known if "all" in arguments.names else arguments.names:
@@ -51,7 +53,7 @@ def main() -> None:
 
 
 def words(name: str, quick: bool, output: Path | None) -> list[str]:
-    """The options of a bench."""
+    """The command-line options for one bench."""
     if name in PRINTING:
         return PRINTING[name] if quick else []
     if name == "runtime":

@@ -1,12 +1,13 @@
-"""Fig. 9 of the paper: a frame's time over the medium's extinction, which lengthens walks and leaves adapters alone.
+"""Fig. 9 of the paper: a frame's time over the medium's extinction, which slows the simulation but not the adapters.
 
 python -m bench.density [--variant scalar_rgb llvm_ad_rgb] [--scene environment] [--size 192] [--spp 64] [--runs 3]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-A nearly white medium between a coat and silver, so that walks end by leaving it alone. Beyond sigma_t = 1, where
-training ends, the adapter is told to clamp: its time counts here, not its picture. Frames of all BSDFs take turns, and
-so do the extinctions, runs times; times are medians. `nma curves` runs the network when the scene is loaded, `nma
-online` at every shading point. Flatness is the largest time over all extinctions to the smallest.
+The material is a nearly white medium between a coat and silver. The medium hardly absorbs, so walks end only when they
+leave the material. The training range ends at sigma_t = 1. Beyond it the adapter clamps, because this bench needs its
+time and not its picture. BSDFs and extinctions take turns, and this repeats --runs times; times are medians. `nma
+curves` runs the network when the scene is loaded, `nma online` at every shading point. Flatness is the largest time
+over all extinctions, divided by the smallest.
 
 Writes density.json and density.png.
 """
@@ -56,7 +57,7 @@ def parse() -> argparse.Namespace:
 
 
 def bsdfs(sigma: float) -> dict[str, dict[str, Any]]:
-    """What is compared, by name."""
+    """The BSDFs that are compared, by name."""
     white = nma.load_material("frosted-silver").changed(MATERIAL | {"sigma_t": sigma})
     subject = scenes.Subject(white)
     curves = scenes.adapter(subject, DEFAULT_ADAPTER, clamp=True)
@@ -69,7 +70,7 @@ def bsdfs(sigma: float) -> dict[str, dict[str, Any]]:
 
 
 def measure(variant: str, arguments: argparse.Namespace) -> Seconds:
-    """Median seconds of a frame, by BSDF and extinction."""
+    """Returns the median seconds of a frame, by BSDF and extinction."""
     every: dict[str, dict[float, list[float]]] = {}
     size, make = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
     with frames.bar(variant, "extinctions", arguments.runs * len(arguments.sigma)) as advance:
@@ -86,12 +87,12 @@ def measure(variant: str, arguments: argparse.Namespace) -> Seconds:
 
 
 def flatness(times: dict[float, float]) -> float:
-    """The longest time to the shortest: 1 is flat."""
+    """The longest time divided by the shortest; 1 means that all times are equal."""
     return max(times.values()) / min(times.values())
 
 
 def plot(seconds: dict[str, Seconds], arguments: argparse.Namespace, path: Path) -> None:
-    """Times over extinction, one panel for each renderer."""
+    """Draws the times over the extinction, one panel for each renderer."""
     figure = Figure(figsize=(1.0 + 4.6 * len(seconds), 3.8), layout="constrained")
     for axes, (variant, by_bsdf) in zip(
         np.atleast_1d(figure.subplots(1, len(seconds))), seconds.items(), strict=True

@@ -1,9 +1,9 @@
-"""Import this before Dr.Jit: its cache of kernels is empty then, and compilation takes its time."""
+"""Gives Dr.Jit an empty cache of kernels, so that every kernel is compiled. Import this module before Dr.Jit."""
 
 import os
 import sys
 import tempfile
 
-assert "drjit" not in sys.modules, "import bench.emptycache first"
+assert "drjit" not in sys.modules, "import bench.emptycache before drjit"
 _FOLDER = tempfile.TemporaryDirectory()
 os.environ["DRJIT_CACHE_DIR"] = _FOLDER.name

@@ -1,9 +1,10 @@
-"""How the benches of whole frames measure: in turns, with independent seeds, against converged pictures.
+"""How the benches of whole frames measure: in turns, with independent seeds, and against converged pictures.
 
-Two figures tell how good a frame is. Its variance, mean over pixels and channels, from independent seeds: noise alone.
-Its squared error, the mean squared difference from a converged picture of `layered`: for an adapter noise and bias. The
-converged picture's own noise, known from its independent parts, is subtracted, so that `layered`'s error is its
-variance. An efficiency is 1 / (variance x seconds) or 1 / (error x seconds).
+Two figures tell how good a frame is. The variance is that of frames with independent seeds, averaged over pixels and
+channels; it measures noise only. The squared error is the mean squared difference from a converged picture of
+`layered`. For an adapter it contains noise and bias. The converged picture has noise of its own, which is estimated
+from its independent parts and subtracted. So the squared error of `layered` equals its variance. An efficiency is
+1 / (variance x seconds) or 1 / (error x seconds).
 """
 
 from __future__ import annotations
@@ -32,21 +33,21 @@ from nma.render.progressive import render_passes
 
 ROOT = Path(__file__).parents[1]
 Array = NDArray[np.float64]
-Row = Mapping[str, Any]  # figures by name; None where one is not known
+Row = Mapping[str, Any]  # figures by name; an unknown figure is None
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
 OUTPUT = Path("out/bench")
 REFERENCES = ROOT / "out/bench/references"
-# Of a frame in one piece, which bounds memory.
+# The most samples that a frame renders in one pass. More would need too much memory.
 MOST_SAMPLES = 1 << 23
-# Parts of a converged picture; their spread tells its noise.
+# A converged picture is rendered in this many parts. The spread of the parts gives the picture's noise.
 PARTS, TEASER_PARTS = 4, 16
-# Seeds of converged pictures lie beyond those of frames.
+# Converged pictures use seeds from here on. Frames use smaller ones.
 REFERENCE_SEED = 1_000_000
-EVEN = 1.1  # efficiencies closer than this factor are called even
+EVEN = 1.1  # two efficiencies that differ by less than this factor are called even
 
 
 class Frames(NamedTuple):
-    """Several frames of one scene: pictures (runs, height, width, 3), their seconds and processor seconds (runs,)."""
+    """Several frames of one scene: pictures (runs, height, width, 3), wall seconds and processor seconds (runs,)."""
 
     pictures: Array
     wall: Array
@@ -62,15 +63,17 @@ class Frames(NamedTuple):
 
 
 class Converged(NamedTuple):
-    """A picture (height, width, 3) of many samples, and the mean square of the noise that is left in it."""
+    """A picture (height, width, 3) of many samples, and the mean square of its remaining noise."""
 
     picture: Array
     noise: float
 
 
 def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[int]) -> dict[str, Frames]:
-    """Frames of all the scenes, given as dictionaries: one of each for every seed, so that other load on the machine
-    meets all."""
+    """Renders one frame of every scene (a dictionary, by name) for each seed, and returns the frames by name.
+
+    The scenes take turns, so that other load on the machine slows all of them alike.
+    """
     turn = _turns(scenes, spp)
     found: dict[str, list[tuple[Array, float, float]]] = {name: [] for name in scenes}
     for seed in seeds:
@@ -82,7 +85,7 @@ def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[
 def _turns(
     scenes: Mapping[str, Mapping[str, Any]], spp: int
 ) -> Callable[[str, int], tuple[Array, float, float]]:
-    """What renders a scene by its name with a seed."""
+    """Returns a function of a scene's name and a seed that renders a frame; it returns what `timed` returns."""
     import mitsuba as mi
 
     if mi.variant() == SCALAR:
@@ -90,8 +93,8 @@ def _turns(
         return lambda name, seed: timed(loaded[name], spp, seed)
 
     def alone(name: str, seed: int) -> tuple[Array, float, float]:
-        # Vectorised, every frame traces all BSDFs in memory, so there is to be one scene's alone. The first frame
-        # compiles, or finds its kernel from the last turn.
+        # A vectorised renderer traces all BSDFs in memory for every frame, so only one scene may be loaded at a time.
+        # The first frame compiles the kernel, or finds it in the cache since the last turn.
         gc.collect()
         scene = load_dict(scenes[name])
         timed(scene, spp, seed)
@@ -101,7 +104,8 @@ def _turns(
 
 
 def timed(scene: Any, spp: int, seed: int) -> tuple[Array, float, float]:
-    """A frame of a loaded scene, its wall time and the processor seconds of all threads."""
+    """Renders a loaded scene; returns the picture (height, width, 3), wall seconds, and processor seconds of all
+    threads."""
     width, height = scene.sensors()[0].film().crop_size()
     before, began = processor_seconds(), time.perf_counter()
     if spp * int(width) * int(height) <= MOST_SAMPLES:
@@ -112,7 +116,7 @@ def timed(scene: Any, spp: int, seed: int) -> tuple[Array, float, float]:
 
 
 def processor_seconds() -> float:
-    """Of all threads of this process."""
+    """Processor seconds that all threads of this process have used so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 
@@ -124,10 +128,12 @@ def converged(
     parts: int = PARTS,
     advance: Callable[[], object] = lambda: None,
 ) -> Converged:
-    """A picture of `spp` samples in independent parts.
+    """Renders a picture of `spp` samples per pixel in independent parts.
 
     Args:
-        keep: how the parts' files begin; those that are there already are not rendered again.
+        description: the scene, as a dictionary.
+        keep: the start of the paths under which parts are saved; a part that has a file is not rendered again.
+        parts: how many parts.
         advance: called after each part.
     """
     pictures, scene = [], None
@@ -146,7 +152,7 @@ def converged(
 
 
 def converged_teaser(description: Mapping[str, Any], arguments: argparse.Namespace) -> Converged:
-    """The teaser's, in parts that stay in REFERENCES, with a progress bar."""
+    """The converged picture of the teaser. Its parts are kept in REFERENCES; a progress bar counts them."""
     settings = f"{arguments.size}px_rr-{arguments.rr_depth}_{arguments.variant}"
     keep = REFERENCES / f"teaser-{digest()}_{settings}"
     with bar("converged picture", "parts", TEASER_PARTS) as advance:
@@ -154,13 +160,15 @@ def converged_teaser(description: Mapping[str, Any], arguments: argparse.Namespa
 
 
 def squared_errors(pictures: Array, reference: Converged) -> Array:
-    """Of each frame (runs,), mean over pixels and channels."""
+    """The squared error of each frame (runs,), averaged over pixels and channels."""
     return ((pictures - reference.picture) ** 2).mean(axis=(1, 2, 3)) - reference.noise
 
 
 def figures(frames: Frames, reference: Converged | None = None) -> dict[str, float | None]:
-    """Seconds, variance and, given a converged picture of the same material, squared error and its doubt: the error's
-    standard error over the runs, as a share of it."""
+    """Returns the seconds and the variance of a frame, and its squared error if there is a converged picture.
+
+    `doubt` is the standard error of the squared error over the runs, divided by the squared error.
+    """
     found: dict[str, float | None] = {"seconds": frames.seconds, "variance": frames.variance}
     if reference is None:
         return found | {"error": None, "doubt": None}
@@ -170,7 +178,7 @@ def figures(frames: Frames, reference: Converged | None = None) -> dict[str, flo
 
 
 def ratios(own: Row, simulation: Row) -> dict[str, Any]:
-    """Time, variance, error and efficiencies to those of the simulation; None without an error."""
+    """Time, variance, error and efficiencies, relative to the simulation's. A ratio is None if a figure is unknown."""
     time, variance, error = (ratio(own[key], simulation[key]) for key in ("seconds", "variance", "error"))
     return {
         "time": time,
@@ -182,18 +190,18 @@ def ratios(own: Row, simulation: Row) -> dict[str, Any]:
 
 
 def ratio(a: float | None, b: float | None) -> float | None:
-    """a / b, or None where one is not known, or where a difference of two noisy numbers has come out negative."""
+    """a / b. None if one of them is unknown, or not positive: an error near 0 can come out negative, by noise."""
     return a / b if a and b and a > 0.0 and b > 0.0 else None
 
 
 def geometric_mean(values: Iterable[float | None]) -> float | None:
-    """Of those that are known."""
+    """The geometric mean of the values that are not None; None if there are none."""
     logs = [math.log(value) for value in values if value is not None]
     return math.exp(sum(logs) / len(logs)) if logs else None
 
 
 def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str, dict[str, Any]]:
-    """Geometric means over materials of the ratios to the simulation, by BSDF."""
+    """The ratios to the simulation, as geometric means over materials, by BSDF."""
     each = [{name: ratios(row[name], row[simulation]) for name in row} for row in rows]
     return {
         name: {key: geometric_mean(row[name][key] for row in each) for key in each[0][name]}
@@ -202,13 +210,17 @@ def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str,
 
 
 def mean_doubt(rows: Sequence[Mapping[str, Row]], name: str, simulation: str) -> float | None:
-    """Standard error of the mean ratio of errors, as a share of it; None where there is no error."""
+    """The standard error of the mean ratio of errors, divided by this ratio; None if there is no error."""
     doubts = [row[bsdf]["doubt"] for row in rows for bsdf in (name, simulation)]
     return None if None in doubts else math.hypot(*doubts) / len(rows)
 
 
 def verdict(efficiency: float | None) -> str:
-    """What to render with, from an adapter's efficiency by error relative to the simulation's."""
+    """What to render with: "adapter", "simulation", "even" or "-" (unknown).
+
+    Args:
+        efficiency: the adapter's efficiency by error, relative to the simulation's.
+    """
     if efficiency is None:
         return "-"
     if 1.0 / EVEN <= efficiency <= EVEN:
@@ -217,7 +229,7 @@ def verdict(efficiency: float | None) -> str:
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table of aligned columns: text to the left, numbers to the right."""
+    """A Markdown table with aligned columns: text on the left, numbers on the right."""
     cells = [list(headings), *([_cell(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     text = [all(row[n] == "-" or not _is_number(row[n]) for row in cells[1:]) for n in range(len(headings))]
@@ -250,24 +262,28 @@ def _is_number(text: str) -> bool:
 
 
 def parser(doc: str | None, size: int, spp: int, runs: int) -> argparse.ArgumentParser:
-    """A command line described by the script's docstring, with what every bench of frames takes."""
+    """A command-line parser with the options of every bench of frames; `doc` is the script's docstring."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--size", type=int, default=size, help="height of the pictures, in pixels")
     made.add_argument("--spp", type=int, default=spp, help="samples per pixel of a frame")
-    made.add_argument("--runs", type=int, default=runs, help="frames of each, with seeds of their own")
-    made.add_argument("--rr-depth", type=int, default=RR_DEPTH, help="where Russian roulette begins")
-    made.add_argument("--quick", action="store_true", help="small and few, to see that it runs")
-    made.add_argument("--output", type=Path, help=f"folder of the results, else {OUTPUT} or {OUTPUT}/quick")
+    made.add_argument("--runs", type=int, default=runs, help="frames of each scene, each with its own seed")
+    made.add_argument(
+        "--rr-depth", type=int, default=RR_DEPTH, help="path depth at which Russian roulette begins"
+    )
+    made.add_argument("--quick", action="store_true", help="a small, short run, to see that the bench works")
+    made.add_argument(
+        "--output", type=Path, help=f"folder of the results (default {OUTPUT}; quick: {OUTPUT}/quick)"
+    )
     return made
 
 
 def parse(made: argparse.ArgumentParser, **quick: Any) -> argparse.Namespace:
-    """The arguments; with --quick, `quick` replaces some of them."""
+    """Parses the command line. With --quick, the values in `quick` replace some of the arguments."""
     arguments = made.parse_args()
     if arguments.quick:
         vars(arguments).update(quick)
     if arguments.runs < 2:
-        made.error("--runs: a variance needs 2 or more")
+        made.error("--runs: must be at least 2, to estimate a variance")
     arguments.output = arguments.output or (OUTPUT / "quick" if arguments.quick else OUTPUT)
     return arguments
 
@@ -277,12 +293,12 @@ def settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def write(path: Path, head: str, arguments: argparse.Namespace, **data: Any) -> None:
-    """Results as JSON, after the machine (its `header` at the start) and the settings."""
+    """Writes the results `data` as JSON, after the machine's header `head` and the settings."""
     common.write_json(path, {"machine": head.splitlines(), "settings": settings(arguments)} | data)
 
 
 def begin(variant: str | None = None) -> str:
-    """Prints the machine's header and returns it; chooses Mitsuba's variant."""
+    """Prints the machine's header and returns it. Sets Mitsuba's variant, if one is given."""
     head = header()
     print(head, flush=True)
     if variant:
@@ -292,7 +308,7 @@ def begin(variant: str | None = None) -> str:
 
 @contextmanager
 def bar(what: str, unit: str, total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar; what it yields is called after each of `total` steps."""
+    """Shows a progress bar of `total` steps. Call the function that it yields after each step."""
     with progress(f"{unit}/min") as shown:
         task = shown.add_task(what, total=total, rate="", note="")
 

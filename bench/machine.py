@@ -1,4 +1,4 @@
-"""What every benchmark prints first: the machine, its load, and the command."""
+"""The header that every bench prints first: the machine, its load, and the command."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 
 def header() -> str:
-    """Machine, cores, load average, Python and command, one per line."""
+    """Returns the machine with its cores, the load average, Python's version and the command, one per line."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        # The name alone says little on virtual machines: family 25 of AMD is Zen 3 and 4, family 26 Zen 5.
+        # Virtual machines often hide the processor's name. The family tells more: AMD's 25 is Zen 3 or 4, 26 is Zen 5.
         fields = dict(re.findall(r"^(.*?)\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE))
         names = [
             fields.get("model name"),

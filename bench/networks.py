@@ -1,11 +1,12 @@
-"""What a network costs in a vectorised frame: time over its multiply-adds, beside the simulation and `principled`.
+"""What a network costs in a vectorised frame: the time over the network's multiply-adds.
 
 python -m bench.networks [--scene lights] [--networks 1x16 3x32 3x64 5x64] [--size 160] [--spp 48] [--runs 5]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-A whole frame is one kernel that no profiler looks into. So the material, textured, is rendered by adapters that differ
-in the size of their network alone, with random weights: what is left at size 0 of the line through their times is
-everything but the network. BSDFs take turns; times are medians.
+A whole frame is one kernel, and no profiler can look into it. So this bench renders a textured material with adapters
+that differ only in the size of their network; the weights are random. A line is fitted to their times. The line's value
+at size 0 is the time of everything except the network. The simulation and `principled` are rendered for comparison.
+BSDFs take turns; times are medians.
 
 Writes networks.json and networks.png.
 """
@@ -48,7 +49,7 @@ def main() -> None:
     rows = [[name, products.get(name), s, s / seconds[scenes.SIMULATION]] for name, s in seconds.items()]
     print(frames.markdown(["BSDF", "multiply-adds", "seconds", f"to {scenes.SIMULATION}"], rows))
     shipped = slope * multiply_adds(nma.Adapter.load(DEFAULT_ADAPTER))
-    print(f"everything but the network {rest:.2f} s, the network of {DEFAULT_ADAPTER} {shipped:.2f} s")
+    print(f"everything except the network: {rest:.2f} s; the network of {DEFAULT_ADAPTER}: {shipped:.2f} s")
     frames.write(
         arguments.output / "networks.json",
         head,
@@ -68,7 +69,7 @@ def parse() -> argparse.Namespace:
 
 
 def random_adapter(name: str) -> nma.Adapter:
-    """The shipped adapter with another network, whose weights mean nothing."""
+    """The shipped adapter, but with a network of the size `name` and random weights."""
     trained = nma.Adapter.load(DEFAULT_ADAPTER)
     ends = trained.layers[0][0].shape[1], trained.layers[-1][0].shape[0]
     sizes = [ends[0], *network.hidden(name), ends[1]]
@@ -77,7 +78,7 @@ def random_adapter(name: str) -> nma.Adapter:
 
 
 def multiply_adds(adapter: nma.Adapter) -> int:
-    """Of one query."""
+    """The multiply-adds that the adapter's network needs for one query."""
     return sum(matrix.size for matrix, _ in adapter.layers)
 
 

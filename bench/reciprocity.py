@@ -1,13 +1,14 @@
-"""How far adapters are from reciprocal: what a path traced from the light would see, against one from the camera.
+"""How far adapters are from reciprocal: how much f(wi, wo) and f(wo, wi) differ.
 
 python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
 
-The blend is prepared at the view direction, so that f(wi, wo) and f(wo, wi) are two functions. Without a renderer,
-both are averaged over directions drawn from the blend's own samples. For every named material:
+An adapter prepares its blend at the view direction, so f(wi, wo) and f(wo, wi) are two different functions. A path from
+the camera uses the first, a path from the light would use the second. This bench needs no renderer: it averages both
+functions over directions that are drawn from the blend's own samples. For every named material it prints:
 
-difference      mean of |f(wi, wo) - f(wo, wi)| over all pairs, weighted by both cosines, to the mean of f
-cos .9, .5, .2  brightness with the roles swapped to that without, less 1, of a surface seen at that cosine under a
-                uniform sky
+difference      mean of |f(wi, wo) - f(wo, wi)| over all pairs, weighted by both cosines, divided by the mean of f
+cos .9, .5, .2  relative change of brightness if the two directions are swapped, for a surface that is seen at this
+                cosine under a uniform sky
 
 Writes reciprocity.json.
 """
@@ -31,7 +32,7 @@ COSINES = (0.9, 0.5, 0.2)
 
 
 class Pairs(NamedTuple):
-    """For directions wo drawn for wi, what both orders of the arguments return, divided by the density (3, n)."""
+    """f(wi, wo) and f(wo, wi), each (3, n), for directions wo drawn for wi; divided by the density of wo."""
 
     forward: NDArray
     swapped: NDArray
@@ -53,9 +54,9 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--adapter", default="layered3-5x64")
-    parser.add_argument("--samples", type=int, default=1 << 16, help="pairs of directions of each figure")
+    parser.add_argument("--samples", type=int, default=1 << 16, help="pairs of directions for each figure")
     parser.add_argument(
-        "--quick", action="store_true", help="few pairs of two materials, to see that it runs"
+        "--quick", action="store_true", help="few pairs and two materials, to see that the bench works"
     )
     parser.add_argument("--output", type=Path, default=frames.OUTPUT, help="folder of the results")
     arguments = parser.parse_args()
@@ -69,7 +70,7 @@ def percent(values: list[float]) -> str:
 
 
 def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[float]]:
-    """The figures of a material, RGB each."""
+    """Returns the figures of one material by column, each with a value for R, G and B."""
     rng = np.random.default_rng(0)
     every = pairs(adapter, params, np.sqrt(rng.random(samples)), rng)
     off = np.abs(every.forward - every.swapped).mean(axis=1) / every.forward.mean(axis=1)
@@ -81,16 +82,16 @@ def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[
 
 
 def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Generator) -> Pairs:
-    """Views of these cosines, and for each a direction drawn from the blend there."""
+    """Takes one view direction for each cosine, and draws one light direction for it from the adapter's blend."""
     n = len(cosines)
     wi = at_azimuth_0(cosines)
     brdf = prepared(adapter, params, wi)
-    # Stratified in the number that chooses the lobe.
+    # The number that chooses the lobe is stratified.
     u = rng.permutation((np.arange(n) + rng.random(n)) / n), *rng.random((2, n))
     wo, value, pdf = brdf.sample(wi, *u)
     valid = (pdf > 0.0) & (wo.z > 1e-4)
     wo = Vec3(*(np.where(valid, x, up) for x, up in zip(wo, (0.0, 0.0, 1.0), strict=True)))
-    # f cos(theta_i) becomes f cos(theta_o).
+    # The swapped evaluation returns f cos(theta_i); we need f cos(theta_o).
     back = np.stack(prepared(adapter, params, wo).eval(wo, wi)) * wo.z / wi.z
     weight = np.where(valid, 1.0 / np.where(valid, pdf, 1.0), 0.0)
     return Pairs(np.stack(value) * weight, back * weight)

@@ -2,17 +2,21 @@
 
     python -m bench.render [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
 
-Frames of all BSDFs take turns, so that other load on the machine meets all of them; `load` is its average at start
-and end. `time` is the median wall time of a frame and `cpu` the median of its processor seconds, without
-compilation. The ratios are medians over rounds of a frame's time to that of `principled` in the same round.
-`compile` is what the first frame takes beyond the second, alone and with an empty cache of kernels. `variance` is
-that of one frame, mean over pixels and channels, from independent seeds; `efficiency` 1 / (variance x time). `bias`
-is the root mean square of (expected picture - that of `layered`), from products of independent renderings, or what
-it lies below if it does not stand out of the noise. `smape` compares the mean of the frames with the reference,
-noise of both included: the line of `layered` shows how much that is. `principled` is a stand-in for its time and
-noise; it shows another material.
+All BSDFs take turns, so that other load on the machine slows all of them alike. The columns are:
 
-Writes render.json and render.png: the expected error after a time, from the variance and the bias.
+time        median wall time of a frame, without compilation; cpu: the same in processor seconds
+ratio       a frame's time relative to `principled` in the same round, median over rounds
+compile     extra time of the first frame over the second, with an empty cache of kernels and no other BSDF
+variance    variance of one frame over independent seeds, averaged over pixels and channels
+efficiency  1 / (variance x time)
+bias        root mean square difference between the expected picture and that of `layered`, from products of
+            independent renderings; if it is hidden in the noise, an upper limit (<)
+smape       SMAPE of the mean of the frames against the reference; the line of `layered` shows the part that is noise
+load        average load of the machine, printed at the start and at the end
+
+`principled` shows another material; only its time and noise are of interest.
+
+Writes render.json and render.png. The plot shows the expected error over the rendering time, from variance and bias.
 """
 
 from __future__ import annotations
@@ -78,10 +82,10 @@ def parse() -> argparse.Namespace:
 
 
 def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
-    """For each scene, the BSDFs by name; `layered` and `nma` show the same material, `principled` costs the like."""
+    """For each scene, the BSDFs by name. `layered` and `nma` show the same material; `principled` shows another one."""
     for name in adapters:
         if name not in shipped() and not Path(name).is_file():
-            raise SystemExit(f"there is no adapter {name}; shipped are {', '.join(shipped())}")
+            raise SystemExit(f"no adapter {name}: give a weights file or one of {', '.join(shipped())}")
     gold = scenes.Subject(materials.load("gold-red-lacquer"))
     worn = scenes.worn_silver()._replace(repeats=2.0)
     red = {"type": "rgb", "value": [0.8, 0.2, 0.1]}
@@ -100,7 +104,10 @@ def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def compile_seconds(description: dict[str, Any], spp: int) -> float:
-    """What a first frame takes longer than a second one, without the other BSDFs: Mitsuba compiles all in memory."""
+    """How many seconds longer the first frame takes than the second.
+
+    Mitsuba compiles all BSDFs in memory, so those of other scenes are deleted first.
+    """
     gc.collect()
     scene = load_dict(description)
     first, second = (frames.timed(scene, spp, seed)[1] for seed in range(2))
@@ -108,7 +115,7 @@ def compile_seconds(description: dict[str, Any], spp: int) -> float:
 
 
 def converged_halves(description: dict[str, Any], spp: int) -> list[Array]:
-    """Two independent pictures."""
+    """Two independent pictures (height, width, 3) of `spp` / 2 samples each."""
     scene = load_dict(description)
     return [render_passes(scene, spp // 2, seed=seed).astype(np.float64) for seed in (12345, 54321)]
 
@@ -137,9 +144,10 @@ def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array])
 
 
 def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
-    """Mean over pixels and channels of (expectation - truth)^2, and its standard error.
+    """The mean over pixels and channels of (expectation - truth)^2, and its standard error.
 
-    Products of differences that share no sample have no noise to subtract: all pairs of frames, each with its half.
+    Each term is a product of two differences: one frame less one half, another frame less the other half. The two
+    differences share no sample, so their noise has mean 0 in the product. All pairs of frames are used.
     """
     a, b = pictures - halves[0], pictures - halves[1]
     pairs = len(pictures) * (len(pictures) - 1)
@@ -148,7 +156,7 @@ def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
 
 
 def bias(row: dict[str, Any]) -> float | None:
-    """The root mean square error that is no noise, or None if it does not stand out of it (two standard errors)."""
+    """The root of the squared bias, or None if the squared bias is below two of its standard errors."""
     square, error = row["squared_bias"], row["squared_bias_error"]
     return float(np.sqrt(square)) if square > 2.0 * error else None
 
@@ -167,7 +175,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Root mean square error against rendering time, one panel for each scene."""
+    """Draws the expected root mean square error over rendering time, one panel for each scene."""
     names = list(dict.fromkeys(row["scene"] for row in rows))
     figure = Figure(figsize=(5.0 * len(names), 3.8), layout="constrained")
     panels = figure.subplots(1, len(names), sharey=True)

@@ -1,8 +1,9 @@
-"""Nanoseconds of the C++ runtime by instruction set, beside Eigen, NumPy, drjit.nn and a decoder of 1.07 M numbers.
+"""Times of the C++ runtime in nanoseconds, by instruction set; also of Eigen, NumPy, drjit.nn and a large decoder.
 
 python -m bench.runtime [--json OUT.json]
 
-One thread, best of many repetitions. Eigen takes part where its headers are installed (Debian: libeigen3-dev).
+Each time is the best of many repetitions on one thread. Eigen is measured if its headers are installed (Debian:
+libeigen3-dev). The decoder has 1.07 M numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-# Before NumPy starts its threads.
+# This must be set before NumPy starts its threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import drjit as dr
@@ -39,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="also write all figures here")
+    parser.add_argument("--json", type=Path, help="also write all figures to this file")
     arguments = parser.parse_args()
     print(header(), flush=True)
     rows = cpp() + [row for name in nma.shipped() for row in python(name)]
@@ -64,7 +65,8 @@ def main() -> None:
 
 
 def cpp() -> list[dict]:
-    """Compiles and runs bench/runtime.cpp for the machine at hand; kernels choose their instructions themselves."""
+    """Compiles bench/runtime.cpp for this machine, runs it, and returns its rows. Kernels choose their instruction sets
+    when they run."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "runtime"
         flags = ["-std=c++17", "-O2", "-march=native", f"-I{build.sources()}"]
@@ -76,7 +78,7 @@ def cpp() -> list[dict]:
 
 
 def python(name: str) -> list[dict]:
-    """The network of an adapter in NumPy, and in drjit.nn on one thread."""
+    """Returns the times of an adapter's network in NumPy and in drjit.nn, on one thread."""
     adapter = nma.Adapter.load(name)
     label = name.split("-")[1]
     layers = [(np.asarray(m, np.float32), np.asarray(b, np.float32)) for m, b in adapter.layers]
@@ -91,7 +93,7 @@ def python(name: str) -> list[dict]:
 
 
 def drjit_nn(layers: list, many: np.ndarray) -> float:
-    """Seconds per query of drjit.nn with its packed float16 weights, after a run that compiles."""
+    """Seconds per query of drjit.nn with packed float16 weights; a first run compiles and is not counted."""
     ensure_llvm()
     import drjit.nn as nn
     from drjit.llvm import Float16, Float32, TensorXf16

@@ -3,10 +3,11 @@
 python -m bench.samples [--variant scalar_rgb] [--size 144] [--spp 1024] [--runs 3] [--reference-spp 8192]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-Frames of 1, 2, 4 ... --spp samples, --runs of each or more, BSDFs in turns. The error is that against a converged
-picture of `layered`, whose own noise is subtracted: the simulation's falls for ever, an adapter's down to its squared
-bias. The converged picture is rendered in parts that stay in out/bench/references, so a killed run goes on. What
-variance, error and efficiency are, bench/frames.py tells.
+Frames have 1, 2, 4 ... --spp samples per pixel. Each number of samples is rendered at least --runs times; BSDFs take
+turns. The squared error is measured against a converged picture of `layered`, and the noise of this picture is
+subtracted. The simulation's error falls without end, an adapter's falls to its squared bias. The parts of the converged
+picture are kept in out/bench/references, so a killed run continues where it stopped. bench/frames.py defines variance,
+error and efficiency.
 
 Writes samples.json and samples.png.
 """
@@ -23,7 +24,7 @@ from matplotlib.figure import Figure
 import nma
 from bench import frames, scenes
 
-# Up to so many samples per pixel there are more runs, of so many in total each.
+# A frame of fewer samples per pixel is rendered more often: CHEAP / samples times for each run.
 CHEAP = 32
 Curve = dict[int, dict[str, float | None]]
 
@@ -49,7 +50,7 @@ def parse() -> argparse.Namespace:
 
 
 def describe(arguments: argparse.Namespace) -> dict[str, dict]:
-    """The teaser with each BSDF, by name."""
+    """The teaser scene with each BSDF, by name."""
     size = scenes.teaser_size(arguments.size)
     models: dict[str, Callable[[scenes.Subject], scenes.Bsdf]] = {scenes.SIMULATION: scenes.simulation}
     for name in reversed(nma.shipped()):
@@ -60,7 +61,7 @@ def describe(arguments: argparse.Namespace) -> dict[str, dict]:
 def measure(
     described: dict[str, dict], reference: frames.Converged, arguments: argparse.Namespace
 ) -> dict[str, Curve]:
-    """Seconds, variance and squared error, by BSDF and samples per pixel."""
+    """Returns seconds, variance and squared error, by BSDF and samples per pixel."""
     steps = levels(arguments.spp)
     curves: dict[str, Curve] = {name: {} for name in described}
     with frames.bar("frames", "levels", len(steps)) as advance:
@@ -73,17 +74,17 @@ def measure(
 
 
 def repeats(spp: int, runs: int) -> int:
-    """How many frames: those of few samples cost little, and vary most."""
+    """How many frames to render. Frames of few samples cost little and vary most, so there are more of them."""
     return runs * max(1, CHEAP // spp)
 
 
 def levels(spp: int) -> list[int]:
-    """1, 2, 4 ... up to `spp`."""
+    """The powers of two up to `spp`: 1, 2, 4 ..."""
     return [2**n for n in range(spp.bit_length())]
 
 
 def table(curves: dict[str, Curve]) -> str:
-    """One line for each number of samples: the simulation's figures, and the adapters' relative to them."""
+    """A table with a line for each number of samples: the simulation's figures, and the adapters' relative to them."""
     truth = curves[scenes.SIMULATION]
     headings, rows = ["spp", "seconds", "variance", "error"], []
     for name in curves:
@@ -100,7 +101,7 @@ def table(curves: dict[str, Curve]) -> str:
 
 
 def plot(curves: dict[str, Curve], arguments: argparse.Namespace, path: Path) -> None:
-    """Error over samples and over seconds, the variance dotted."""
+    """Draws the error over samples and over seconds; the variance is dotted."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     for number, (name, curve) in enumerate(curves.items()):

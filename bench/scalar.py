@@ -1,15 +1,16 @@
-"""Table 4 of the paper: unseen materials in Mitsuba's scalar renderer, simulation against adapters, at equal samples.
+"""Table 4 of the paper: simulation and adapters in Mitsuba's scalar renderer, on unseen materials, at equal samples.
 
 python -m bench.scalar [--scene sphere|environment|preview|lights] [--materials 92] [--size 96] [--spp 32] [--runs 3]
     [--error 8] [--reference-spp 2048] [--rr-depth 5] [--quick] [--output out/bench]
 
-BSDFs take turns within a material, so that other load on the machine meets all of them; a frame's time is the median of
-its runs on all cores. What variance, error and efficiency are, bench/frames.py tells; the error is measured for --error
-of the materials. Figures are geometric means over the materials of ratios to `layered`; below 1 is faster for times,
-above 1 better for efficiencies. `online` runs the network at every shading point, `curves` none. `principled` and
-`diffuse` are other materials: a production BSDF's time, and everything but the material's.
+For each material the BSDFs take turns, so that other load on the machine slows all of them alike. A frame's time is the
+median of its runs on all cores. bench/frames.py defines variance, error and efficiency. The error is measured for
+--error of the materials. All figures are ratios to `layered`, as geometric means over the materials: a time below 1 is
+faster, an efficiency above 1 is better. `online` runs the network at every shading point, `curves` runs no network.
+`principled` and `diffuse` show other materials: `principled` stands for the time of a production BSDF, `diffuse` for
+the time of everything except the material.
 
-Writes scalar.json and scalar.png, in other scenes than the default scalar-SCENE.json and scalar-SCENE.png.
+Writes scalar.json and scalar.png for the default scene, and scalar-SCENE.json and scalar-SCENE.png for any other.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import nma
 from bench import frames, scenes
 
 SCENE = "sphere"
-# Means of the paper's Table 4.
+# Mean time and efficiency of the adapter in the paper's Table 4.
 PAPER_TIME, PAPER_EFFICIENCY = 0.58, 1.67
 OTHER_MATERIALS = (scenes.STAND_IN, scenes.NOTHING)
 Figures = dict[str, dict[str, float | None]]
@@ -54,14 +55,20 @@ def main() -> None:
 def parse() -> argparse.Namespace:
     parser = frames.parser(__doc__, size=96, spp=32, runs=3)
     parser.add_argument("--scene", choices=scenes.SCENES, default=SCENE)
-    parser.add_argument("--materials", type=int, default=92, help="drawn from the paper's ranges")
-    parser.add_argument("--error", type=int, default=8, help="materials whose error is measured too")
-    parser.add_argument("--reference-spp", type=int, default=2048, help="samples of the converged pictures")
+    parser.add_argument(
+        "--materials", type=int, default=92, help="how many materials to draw from the paper's ranges"
+    )
+    parser.add_argument(
+        "--error", type=int, default=8, help="how many materials also have their error measured"
+    )
+    parser.add_argument(
+        "--reference-spp", type=int, default=2048, help="samples per pixel of the converged pictures"
+    )
     return frames.parse(parser, materials=2, size=32, spp=8, runs=2, error=1, reference_spp=64)
 
 
 def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
-    """What is compared, by name."""
+    """The BSDFs that are compared, by name."""
     found = {scenes.SIMULATION: scenes.simulation(subject)}
     for name in nma.shipped():
         found[f"{scenes.short(name)} online"] = scenes.network(subject, name)
@@ -71,10 +78,10 @@ def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
 
 
 def compare(subject: scenes.Subject, number: int, arguments: argparse.Namespace) -> Figures:
-    """Seconds, variance and, for the first materials, squared error of every BSDF."""
+    """Returns seconds and variance of every BSDF; for the first --error materials, also the squared error."""
     size, scene = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
     described = {name: scene(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs(subject).items()}
-    # Other materials get other samples, or their noise would be alike.
+    # Each material has its own seeds. With equal seeds, the noise of all materials would be alike.
     seeds = range(number * arguments.runs, (number + 1) * arguments.runs)
     measured = frames.in_turns(described, arguments.spp, seeds)
     reference = None
@@ -87,7 +94,7 @@ def compare(subject: scenes.Subject, number: int, arguments: argparse.Namespace)
 
 
 def plot(rows: list[Figures], scene: str, path: Path) -> None:
-    """Every material's time and efficiency, sorted, against the paper's means."""
+    """Draws the time and the efficiency of every material, sorted, with the paper's means as lines."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     for name in rows[0]:

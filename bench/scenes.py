@@ -1,4 +1,4 @@
-"""What the benches of whole frames render: scenes, materials, and a material as each BSDF that is compared."""
+"""What the benches of whole frames render: the scenes, the materials, and the BSDFs that show a material."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from nma.render.scene import Camera, preview_scene
 from nma.render.shaderball import shader_ball_file
 from nma.render.textures import bitmap_texture, periodic_noise, procedural_textures
 
-DEPTH, RR_DEPTH = 6, 5  # longest path, and Mitsuba's default for where Russian roulette begins
+DEPTH, RR_DEPTH = 6, 5  # the longest path, and the depth at which Russian roulette begins (Mitsuba's default)
 SIMULATION, STAND_IN, NOTHING = "layered", "principled", "diffuse"
-# All but the material: its frame is the time that no BSDF can go below.
+# A frame of this BSDF takes the time of everything except the material. No BSDF can be faster.
 DIFFUSE = {"type": "diffuse"}
 TEXELS = 512
-# Small and bright, out of the camera's sight: direction from the ball's middle, distance, and the light's colour.
+# Small, bright lights out of the camera's sight: direction from the ball's centre, distance, colour.
 LIGHTS = (
     ((-1.00, -0.70, 0.85), 2.4, (1.00, 0.85, 0.65)),
     ((0.80, -0.50, 0.55), 2.2, (0.70, 0.85, 1.00)),
@@ -36,7 +36,7 @@ LIGHTS = (
     ((0.25, -1.00, 0.75), 4.0, (1.00, 0.92, 0.80)),
 )
 LIGHTS_AROUND = (0.0, 0.0, 1.1)
-LIGHT_RADIUS, LIGHT_POWER = 0.06, 90.0  # radiance at distance 1; it grows with the distance squared
+LIGHT_RADIUS, LIGHT_POWER = 0.06, 90.0  # the radiance is LIGHT_POWER x distance^2
 WIDE = Camera((0.0, -8.6, 3.0), (0.0, 0.0, 1.0), 18.2)
 TEASER_ASPECT = 20 / 9
 SOFT_BOX_PLACE, SOFT_BOX_SIZE, SOFT_BOX_RADIANCE = (-3.4, -3.6, 4.6), (1.6, 1.0, 1.0), 0.18
@@ -44,14 +44,14 @@ Bsdf = Mapping[str, Any]
 
 
 class Subject(NamedTuple):
-    """A source material, textures (height, width[, 3]) for some of its parameters, and how often they repeat."""
+    """A material, textures (height, width[, 3]) for some of its parameters, and how often the textures repeat."""
 
     material: Material
     textures: Mapping[str, NDArray[np.floating]] = {}
     repeats: float = 2.0
 
     def images(self) -> dict[str, Any]:
-        """The textures as Mitsuba's; made anew for the variant in use."""
+        """The textures as Mitsuba's textures for the current variant."""
         return {name: bitmap_texture(values, scale=self.repeats) for name, values in self.textures.items()}
 
 
@@ -60,14 +60,16 @@ def simulation(subject: Subject) -> dict[str, Any]:
 
 
 def adapter(subject: Subject, name: str, clamp: bool = False) -> dict[str, Any]:
-    """By a shipped adapter or a weights file: curves over the angle without textures, with them the network."""
+    """The BSDF `nma` of a shipped adapter or a weights file. Without textures it renders from curves over the angle;
+    with textures it runs the network."""
     return material_bsdf(subject.material, "nma", adapter=name, clamp=clamp) | subject.images()
 
 
 def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
-    """An adapter whose network runs at every shading point.
+    """Makes an adapter run its network at every shading point.
 
-    The scalar plugin has an option for that; elsewhere a texture asks for it, here one of a single value.
+    The scalar plugin has an option for this. In other variants, a texture makes the network run; if the BSDF has no
+    texture for sigma_t, it gets one of a single value.
     """
     import mitsuba as mi
 
@@ -79,19 +81,19 @@ def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
 
 
 def network(subject: Subject, name: str, precision: str = "compact") -> dict[str, Any]:
-    """By an adapter whose network runs at every shading point."""
+    """The BSDF of an adapter whose network runs at every shading point."""
     return online(adapter(subject, name), precision)
 
 
 def stand_in(subject: Subject) -> dict[str, Any]:
-    """Mitsuba's `principled`, textured alike: another material, for its time and noise."""
+    """Mitsuba's `principled` with the same textures. It shows another material; only its time and noise count."""
     names = {"albedo": "base_color", "alpha_bottom": "roughness", "sigma_t": "metallic"}
     images = {names[name]: image for name, image in subject.images().items()}
     return {"type": "principled", "metallic": 0.7, "roughness": 0.3, "clearcoat": 0.5} | images
 
 
 def short(name: str) -> str:
-    """layered3-5x64 -> 5x64."""
+    """The size of the network in an adapter's name: layered3-5x64 -> 5x64."""
     return name.split("-")[-1]
 
 
@@ -102,7 +104,7 @@ def unseen(count: int, seed: int = 92) -> list[Subject]:
 
 
 def worn_silver() -> Subject:
-    """Silver under worn lacquer, marbled: its roughness, the pigment and its amount come from textures."""
+    """Silver under worn, marbled lacquer. The roughness, the pigment and the amount of pigment come from textures."""
     silver = nma.load_material("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
     return Subject(silver, procedural_textures(TEXELS), repeats=1.0)
 
@@ -142,7 +144,7 @@ def preview(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict
 
 
 def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
-    """The ball in the dark among small, bright lights: their sampling and highlights dominate the noise."""
+    """The shader ball in the dark among small, bright lights. Light sampling and highlights dominate the noise."""
     scene = preview(bsdf, size, rr_depth)
     del scene["sky"], scene["lamp"]
     return scene | {f"light-{n}": _light(*light) for n, light in enumerate(LIGHTS)}
@@ -151,7 +153,7 @@ def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[
 def sphere(
     bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH, hide_sun: bool = False
 ) -> dict[str, Any]:
-    """A sphere that fills the picture under sun and sky, one environment map: the material dominates the time."""
+    """A sphere that fills the picture under sun and sky (one environment map). The material dominates the time."""
     options: dict[str, Any] = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": hide_sun}
     scene = preview_scene(bsdf, size=size, **options)
     del scene["floor"], scene["lamp"]
@@ -161,7 +163,7 @@ def sphere(
 
 
 def environment(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
-    """The same sphere under the sky alone, which has no bright spot."""
+    """The scene `sphere` without the sun: the sky alone has no bright spot."""
     return sphere(bsdf, size, rr_depth, hide_sun=True)
 
 
@@ -176,10 +178,10 @@ SCENES: dict[str, Callable[[Bsdf, tuple[int, int], int], dict[str, Any]]] = {
 def teaser(
     model: Callable[[Subject], Bsdf], size: tuple[int, int], rr_depth: int = RR_DEPTH
 ) -> dict[str, Any]:
-    """Three shader balls, one of each textured material, each as the BSDF that `model` makes of it.
+    """Three shader balls, one for each textured material; `model` makes the BSDF of a material.
 
-    The light is soft: under a sun a few pixels hold nearly all of the noise, and many runs would be needed to tell
-    BSDFs apart.
+    The light is soft. Under a sun, a few pixels would hold nearly all of the noise, and many runs would be needed to
+    tell the BSDFs apart.
     """
     import mitsuba as mi
 
@@ -203,12 +205,13 @@ def teaser(
 
 
 def teaser_size(height: int) -> tuple[int, int]:
-    """Width and height."""
+    """Width and height of the teaser, in pixels."""
     return round(TEASER_ASPECT * height), height
 
 
 def digest() -> str:
-    """Names pictures that are kept: another scene has other ones."""
+    """A hash of the code that makes the scenes. It is part of the names of stored pictures, so a changed scene is
+    rendered again."""
     modules = (nma.render.scene, nma.render.lighting, nma.render.textures)
     files = [__file__, *(module.__file__ for module in modules)]
     return hashlib.sha256(b"".join(Path(str(file)).read_bytes() for file in files)).hexdigest()[:8]
@@ -219,7 +222,7 @@ def _path(rr_depth: int) -> dict[str, Any]:
 
 
 def _light(towards: tuple[float, ...], distance: float, colour: tuple[float, ...]) -> dict[str, Any]:
-    """Alike bright on the ball at every distance."""
+    """A small spherical light. Its radiance grows with the distance, so all lights are equally bright on the ball."""
     direction = np.array(towards) / np.linalg.norm(towards)
     radiance = (LIGHT_POWER * distance**2 * np.array(colour)).tolist()
     return {

@@ -1,16 +1,17 @@
-"""Simulation or adapter? Time, variance, error and efficiency by renderer, scene, and with or without textures.
+"""Simulation or adapter? Time, variance, error and efficiency, by renderer, by scene, and with or without textures.
 
 python -m bench.settings [--variant scalar_rgb llvm_ad_rgb] [--scene preview lights environment] [--materials 4]
     [--size 192] [--spp 64] [--runs 4] [--reference-spp 1024] [--rr-depth 5] [--quick] [--output out/bench]
 
-Untextured materials are unseen ones of the paper's ranges, and adapters curves over the viewing angle; textured ones
-are those of bench/scenes.py, where the network runs at every shading point. Figures are geometric means over the
-materials of ratios to `layered`; what variance, error and efficiency are, bench/frames.py tells. The verdict goes by
-the efficiency by error, "even" within 10 %; `doubt` is its standard error as a share of it, from the runs: a few bright
-pixels hold most of the noise under sun and lamps. `principled` is a stand-in, another material: it has no error.
+Untextured materials are unseen materials of the paper's ranges; their adapters render from curves over the viewing
+angle. Textured materials are those of bench/scenes.py; their network runs at every shading point. All figures are
+ratios to `layered`, as geometric means over the materials. bench/frames.py defines variance, error and efficiency. The
+verdict compares efficiencies by error; efficiencies within 10 % are "even". `doubt` is the relative standard error of
+this efficiency over the runs. It is large under sun and lamps, where a few bright pixels hold most of the noise.
+`principled` shows another material, so it has no error.
 
-BSDFs take turns. A vectorised renderer compiles before the clock starts, but traces every frame anew in Python, some
-0.05 s for the larger network: in smaller frames than these adapters look slower there.
+BSDFs take turns. A vectorised renderer compiles before the clock starts. But it traces every frame in Python again,
+which takes about 0.05 s for the larger network. So adapters look slower in frames that are smaller than these.
 
 Writes settings.json, settings.md (the table) and settings.png (efficiencies by error).
 """
@@ -65,8 +66,11 @@ def main() -> None:
 
 
 def unfinished(arguments: argparse.Namespace) -> Path:
-    """Where a run with these settings keeps what it has measured until it is complete, so that a killed one goes on.
-    What was measured in other scenes does not count."""
+    """The folder where a run with these settings keeps its measurements until it is complete.
+
+    A killed run continues from them. The folder's name depends on the scenes' code, so measurements of changed scenes
+    are not used.
+    """
     kept = "-".join(
         str(getattr(arguments, name)) for name in ("size", "spp", "runs", "reference_spp", "rr_depth")
     )
@@ -77,14 +81,18 @@ def parse() -> argparse.Namespace:
     parser = frames.parser(__doc__, size=192, spp=64, runs=4)
     parser.add_argument("--variant", nargs="+", default=[frames.SCALAR, frames.VECTORISED])
     parser.add_argument("--scene", nargs="+", choices=scenes.SCENES, default=SCENES)
-    parser.add_argument("--materials", type=int, default=4, help="untextured ones")
-    parser.add_argument("--textured", type=int, default=len(scenes.TEXTURED), help="textured ones")
-    parser.add_argument("--reference-spp", type=int, default=1024, help="samples of the converged pictures")
+    parser.add_argument("--materials", type=int, default=4, help="how many untextured materials")
+    parser.add_argument(
+        "--textured", type=int, default=len(scenes.TEXTURED), help="how many textured materials"
+    )
+    parser.add_argument(
+        "--reference-spp", type=int, default=1024, help="samples per pixel of the converged pictures"
+    )
     return frames.parse(parser, size=32, spp=8, runs=2, materials=1, textured=1, reference_spp=64)
 
 
 def subjects(kind: str, arguments: argparse.Namespace) -> Iterator[scenes.Subject]:
-    """The materials of one kind, made one after the other."""
+    """Yields the materials of one kind, "untextured" or "textured"."""
     if kind == "untextured":
         yield from scenes.unseen(arguments.materials)
     else:
@@ -92,7 +100,7 @@ def subjects(kind: str, arguments: argparse.Namespace) -> Iterator[scenes.Subjec
 
 
 def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
-    """What is compared, by name."""
+    """The BSDFs that are compared, by name."""
     found = {scenes.SIMULATION: scenes.simulation(subject)}
     for name in reversed(nma.shipped()):
         make = scenes.network if subject.textures else scenes.adapter
@@ -103,7 +111,7 @@ def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
 def compare(
     subject: scenes.Subject, scene: str, number: int, arguments: argparse.Namespace
 ) -> dict[str, dict[str, float | None]]:
-    """Seconds, variance and squared error of every BSDF."""
+    """Returns seconds, variance and squared error of every BSDF."""
     size, make = (arguments.size, arguments.size), scenes.SCENES[scene]
     described = {name: make(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs(subject).items()}
     seeds = range(number * arguments.runs + 1, (number + 1) * arguments.runs + 1)
@@ -118,7 +126,7 @@ def compare(
 def summary(
     place: dict[str, str], measured: list[dict[str, dict[str, float | None]]]
 ) -> list[dict[str, Any]]:
-    """Rows of the table for one setting, one for each BSDF but the simulation."""
+    """The table's rows for one setting: one for each BSDF except the simulation."""
     means = frames.mean_ratios(measured, scenes.SIMULATION)
     rows = []
     for name, figures in means.items():
@@ -130,7 +138,7 @@ def summary(
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Bars of every adapter's efficiency by error in every setting, one panel for each renderer."""
+    """Draws the efficiency by error of every adapter in every setting as bars, one panel for each renderer."""
     renderers = list(dict.fromkeys(row["renderer"] for row in rows))
     names = [name for name in dict.fromkeys(row["BSDF"] for row in rows) if name != scenes.STAND_IN]
     figure = Figure(figsize=(9.5, 0.6 + 3.0 * len(renderers)), layout="constrained")
@@ -141,7 +149,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             gains = [row["efficiency by error"] or np.nan for row in own if row["BSDF"] == name]
             width = 0.8 / len(names)
             middles = np.arange(len(places)) + (n - 0.5 * (len(names) - 1)) * width
-            # Bars begin at 1, where simulation and adapter are even.
+            # Bars begin at 1: there, adapter and simulation are equally efficient.
             bars = axes.bar(middles, np.array(gains) - 1.0, width, bottom=1.0, label=name)
             axes.bar_label(bars, [f"{gain:.2f}" for gain in gains], fontsize="small", padding=1)
         axes.axhline(1.0, color="k", linewidth=0.8)

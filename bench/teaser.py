@@ -1,12 +1,12 @@
-"""Fig. 1 of the paper: a textured scene at equal samples, by simulation and by adapter.
+"""Fig. 1 of the paper: a textured scene, rendered by simulation and by the adapter at equal samples per pixel.
 
 python -m bench.teaser [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3] [--reference-spp 2048]
     [--adapter layered3-5x64] [--rr-depth 5] [--quick] [--output out/bench]
 
-Three shader balls whose parameters come from textures, so that the network runs at every shading point. Below the
-pictures: a frame's median time, variance, squared error and SMAPE against the converged picture, and efficiencies to
-those of the simulation; what these are, bench/frames.py tells. The converged picture is rendered in parts that stay in
-out/bench/references, so a killed run goes on.
+The scene has three shader balls. Their parameters come from textures, so the network runs at every shading point. A
+table below the pictures shows the median time of a frame, its variance, its squared error and SMAPE against the
+converged picture, and the efficiencies relative to the simulation's. bench/frames.py defines these figures. The parts
+of the converged picture are kept in out/bench/references, so a killed run continues where it stopped.
 
 Writes teaser.json and teaser.png.
 """
@@ -29,7 +29,7 @@ from nma.render.load import DEFAULT_ADAPTER
 
 ENLARGED = 4
 Figures = Mapping[str, Mapping[str, Any]]
-# What is enlarged: a name, and the upper left corner as shares of width and height.
+# The parts of the picture that are enlarged: a name, and the upper left corner as fractions of width and height.
 CROPS = {"Silver": (0.02, 0.30), "Copper": (0.36, 0.36), "Gold": (0.68, 0.36)}
 
 
@@ -73,7 +73,7 @@ def sheet(
     arguments: argparse.Namespace,
     path: Path,
 ) -> None:
-    """The pictures side by side, enlarged parts of them, and a table."""
+    """Writes the pictures side by side, with enlarged parts of them and a table."""
     under = ["", *("{seconds:.2f} s, squared error {error:.2e}".format(**row) for row in rows.values())]
     lines = [Row("", pictures, under)]
     lines += [Row(name, [enlarge(picture, corner) for picture in pictures]) for name, corner in CROPS.items()]
@@ -84,7 +84,7 @@ def sheet(
 
 
 def table(rows: Figures, ratios: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """What stands below the pictures: both BSDFs' figures, and the adapter's to the simulation's."""
+    """The table below the pictures: the figures of both BSDFs, and the ratios of the adapter to the simulation."""
     headings = ("", "time", "variance", "squared error", "SMAPE", "efficiency by variance", "by error")
     keys = ("time", "variance", "error", "smape", "efficiency by variance", "efficiency by error")
     shapes = ("{:.2f} s", "{:.2e}", "{:.2e}", "{:.3f}")
@@ -98,7 +98,7 @@ def table(rows: Figures, ratios: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def enlarge(picture: NDArray, corner: tuple[float, float]) -> NDArray:
-    """A part of the picture at the picture's size, every pixel a block."""
+    """Enlarges a part of the picture to the size of the picture; every pixel becomes a block."""
     height, width = picture.shape[:2]
     tall, wide = -(-height // ENLARGED), -(-width // ENLARGED)
     top, left = min(int(corner[1] * height), height - tall), min(int(corner[0] * width), width - wide)

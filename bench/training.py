@@ -1,9 +1,15 @@
-"""Bins per second of a training step, ours and the paper's recipe, and what part of a step each stage takes.
+"""Bins per second of a training step, for our recipe and the paper's, and the time of each stage of a step.
 
 python -m bench.training [--steps 300]
 
-Stages: drawing a batch (on a thread of its own), the network with its derivatives, the target over the points of the
-bins with its derivatives and Adam, and the term of the directional albedo. The last two are differences of whole steps.
+The stages are:
+
+drawing  drawing a batch, on a separate thread
+network  the network and its derivatives
+target   the target and its derivatives at the points of the bins, and Adam
+albedo   the term of the directional albedo
+
+The times of the last two are differences between times of whole steps.
 """
 
 from __future__ import annotations
@@ -26,7 +32,9 @@ from nma.train.run import initial_layers
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--steps", type=int, default=300)
     steps = parser.parse_args().steps
     print(header())
@@ -38,7 +46,7 @@ def main() -> None:
 
 
 def measure(pool: Pool, name: str, network: str, steps: int) -> str:
-    """One line of the table: a preset's training on a small pool, milliseconds per step."""
+    """Trains a preset on a small pool, and returns one line of the table, in milliseconds per step."""
     recipe = preset(name, steps=steps, network=network)
     sampler = BinSampler(recipe.bins_law)
     began = time.perf_counter()
@@ -53,7 +61,7 @@ def measure(pool: Pool, name: str, network: str, steps: int) -> str:
 
 
 def seconds(recipe: Recipe, batches: list[Batch]) -> tuple[float, float]:
-    """Milliseconds of a whole step, on the clock and of all cores."""
+    """Milliseconds of a whole step: wall time, and processor time of all cores."""
     clock: list[tuple[float, float]] = []
     run = loop.start(recipe, initial_layers(recipe, nma.LAYERED3))
     loop.train(
@@ -62,13 +70,13 @@ def seconds(recipe: Recipe, batches: list[Batch]) -> tuple[float, float]:
         batches.__getitem__,
         progress=lambda _: clock.append((time.perf_counter(), time.process_time())),
     )
-    # The first group compiles.
+    # The first group of steps compiles, so it is not counted.
     wall, cpu = (np.array(clock[-1]) - np.array(clock[0])) / (recipe.steps - loop.GROUP)
     return 1e3 * wall, 1e3 * cpu
 
 
 def network_seconds(recipe: Recipe, batch: Batch, repeats: int = 200) -> float:
-    """Milliseconds of the network's pass over a batch, there and back."""
+    """Milliseconds that the network takes for a batch, forward and backward."""
     layers = initial_layers(recipe, nma.LAYERED3)
     passes = jax.jit(jax.grad(lambda layers: (network_outputs(layers, batch, recipe) ** 2).sum()))
     jax.block_until_ready(passes(layers))

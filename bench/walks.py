@@ -1,4 +1,4 @@
-"""Walks per second of the layered source over Table 1 draws, for several numbers of materials, and peak memory.
+"""Walks per second of the source `layered3`, for several numbers of materials from Table 1's ranges, and peak memory.
 
 python -m bench.walks [--walks 819200] [--repeat 3]
 """
@@ -24,7 +24,7 @@ def main() -> None:
     print(header())
     source = nma.source("layered3")
     print(
-        f"{'materials':>9} {'seconds':>8} {'Mwalks/s':>9}   (best of {arguments.repeat}, after one run that compiles)"
+        f"{'materials':>9} {'seconds':>8} {'Mwalks/s':>9}   (best of {arguments.repeat}, after a first run to compile)"
     )
     for count in (16, 32, 64, 128):
         params = nma.LAYERED3.sample(np.random.default_rng(count), count)
