@@ -1,4 +1,4 @@
-"""What this machine lacks to run the package, and the command that mends it."""
+"""Checks whether this machine has all that the package needs, and says how to install what is missing."""
 
 import ctypes
 import importlib
@@ -48,9 +48,9 @@ SYSTEM_PACKAGES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at: whether it is `ok`, what was `found`, and the command that mends it ("" if ok).
+    """The result of one check: whether it is `ok`, what was `found`, and a command as `fix` ("" if it is ok).
 
-    What is `optional` only adds a feature; `found` says which.
+    An `optional` part adds a feature, which `found` names. The package runs without it.
     """
 
     name: str
@@ -61,9 +61,9 @@ class Finding:
 
 
 def check() -> list[Finding]:
-    """Looks at everything the package needs; starts no kernel and changes no setting but DRJIT_LIBLLVM_PATH.
+    """Checks everything the package needs. Starts no kernel, and changes no setting other than DRJIT_LIBLLVM_PATH.
 
-    The order is that of repair: a later finding may depend on an earlier one.
+    Fix the findings in their order, since a later one may depend on an earlier one.
     """
     needed = {"drjit": "", "mitsuba": "", "numpy": "", "safetensors": "", "zarr": "", "matplotlib": ""}
     needed["PIL"] = "pillow"
@@ -89,7 +89,7 @@ def _advice(what: str) -> str:
 
 
 def _system() -> Finding:
-    """Linux is what all tests run on."""
+    """Whether the operating system is supported. All tests run on Linux."""
     system = llvm.platform()
     if system == "windows":
         return Finding(
@@ -128,11 +128,14 @@ def _llvm() -> Finding:
 
 
 def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
-    """Imports the module `name`, optional if it has a `purpose`; `distribution` is its name for pip."""
+    """Checks that the module `name` can be imported.
+
+    A module with a `purpose` is optional. `distribution` is the module's name for pip, if it differs.
+    """
     distribution = distribution or name
     try:
         importlib.import_module(name)
-    except Exception as error:  # a library that a module links may be missing: not always an ImportError
+    except Exception as error:  # a missing shared library need not raise an ImportError
         found = f"for {purpose}; not installed" if purpose else f"cannot be imported: {error}"
         fix = f"{sys.executable} -m pip install '{_requirement(distribution)}'"
         return Finding(name, False, found, fix, bool(purpose))
@@ -140,7 +143,7 @@ def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
 
 
 def _requirement(distribution: str) -> str:
-    """The distribution with the versions that this package asks for, as in "mitsuba==3.9.*"."""
+    """The requirement of this package for a distribution, with its versions, such as "mitsuba==3.9.*"."""
     try:
         wanted = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
@@ -158,7 +161,7 @@ def _compiler() -> Finding:
 
 
 def _cuda() -> Finding:
-    """Asks the driver for its devices, without creating a context on any."""
+    """Counts the devices of the NVIDIA driver, without creating a CUDA context."""
     purpose = "for rendering and simulating on a GPU"
     try:
         driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")

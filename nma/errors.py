@@ -1,18 +1,18 @@
-"""Errors that users meet. Each message says what is wrong, where, and what to do next."""
+"""The errors that this package raises. Each message says what is wrong, where, and what to do next."""
 
 import re
 import textwrap
 
 _TRACEBACK = "Traceback (most recent call last):"
-_LONGEST = 600  # letters of an error that prints whole objects
+_LONGEST = 600  # most characters of a message: some of Mitsuba's errors print whole objects
 
 
 class NmaError(Exception):
-    """Base of all errors raised on purpose by this package; the command line prints them without a traceback."""
+    """The base of all errors that this package raises on purpose. The command line prints them without a traceback."""
 
 
 class ParamError(NmaError, ValueError):
-    """A source parameter is missing, has the wrong shape, is not finite, or lies outside its range."""
+    """A parameter of a source is missing, has the wrong shape, is not finite, or lies outside its range."""
 
 
 class MaterialError(NmaError, ValueError):
@@ -32,7 +32,7 @@ class DatasetError(NmaError, ValueError):
 
 
 class SourceError(NmaError, ValueError):
-    """A file of measurements or weights, or a renderer's BSDF, is missing, damaged, or not what a source can read."""
+    """A file of measurements or weights, or a renderer's BSDF, is missing, damaged, or of a kind no source can read."""
 
 
 class TableError(NmaError, ValueError):
@@ -40,20 +40,23 @@ class TableError(NmaError, ValueError):
 
 
 class OutputError(NmaError, OSError):
-    """A file cannot be written: a full disk, a folder in its place, no permission."""
+    """A file cannot be written: the disk is full, a folder has the file's name, or permission is denied."""
 
 
 class MissingDependencyError(NmaError, ImportError):
-    """A library this feature needs is missing or too old."""
+    """A package or a program that a feature needs is missing or too old."""
 
 
 def one_line(message: str) -> str:
-    """Mitsuba's error: where, and what is wrong, without lines of source code; of a traceback only the error."""
+    """Shortens an error message of Mitsuba to one line with the place and the fault.
+
+    Leaves out locations in Mitsuba's source code, and all of a traceback but the error itself.
+    """
     message = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip())
     message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
     head, traceback, _ = message.partition(_TRACEBACK)
     if traceback:
-        # Lines of a traceback are indented; what follows is the error, of one line or more.
+        # The lines of a traceback are indented. The lines after them are the error.
         error = re.search(
             r"^(?!\s)(?:[\w.]+: )?(.*)", message.rpartition(_TRACEBACK)[2].lstrip("\n"), re.M | re.S
         )

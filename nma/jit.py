@@ -1,8 +1,8 @@
-"""Dr.Jit, loaded with a libLLVM that it survives: modules of this package take `dr` from here.
+"""Dr.Jit, loaded with a libLLVM that is new enough. All modules of this package import `dr` from here.
 
-Dr.Jit chooses its libLLVM when it is first imported, and an old one kills the process at the first kernel. So the
-choice stands here, before that import. Without a usable libLLVM importing this module raises
-`MissingDependencyError`, unless Dr.Jit computes on a GPU.
+Dr.Jit chooses its libLLVM when it is first imported. A libLLVM that is too old kills the process at the first kernel,
+so this module chooses one before it imports Dr.Jit. If there is no usable libLLVM and no GPU for Dr.Jit, importing this
+module raises `MissingDependencyError`.
 """
 
 import ctypes
@@ -15,7 +15,10 @@ __all__ = ["dr"]
 
 
 def _has_gpu() -> bool:
-    """Whether Dr.Jit can do without libLLVM. Looks for a driver first, since Dr.Jit's import complains on stderr."""
+    """Whether Dr.Jit can run on a GPU and so needs no libLLVM.
+
+    Looks for a driver first, because importing Dr.Jit without libLLVM prints a warning to stderr.
+    """
     try:
         ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
     except OSError:

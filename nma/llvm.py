@@ -1,9 +1,9 @@
-"""Finding a libLLVM that Dr.Jit can compile CPU kernels with.
+"""Finds a libLLVM with which Dr.Jit can compile CPU kernels.
 
-An old one does not fail, it kills the process while Dr.Jit compiles a kernel ("LLVM ERROR: Cannot select").
-So the package looks for the newest one on the system itself, and refuses old ones beforehand.
+An old libLLVM raises no error: it kills the process while Dr.Jit compiles a kernel ("LLVM ERROR: Cannot select"). So
+this module looks for the newest libLLVM of the system, and refuses an old one before Dr.Jit loads it.
 
-Standard library only, and runnable as a file (`python3 -I nma/llvm.py`) before anything is installed.
+The file needs only the standard library. It can be run before anything is installed: `python3 -I nma/llvm.py`.
 """
 
 import ctypes
@@ -16,12 +16,12 @@ import sys
 from functools import cache
 from pathlib import Path
 
-# With AVX-512, Dr.Jit 1.5 dies in 15 and 16 (`fmaximum`); 17, 18, 19 and 22 rendered the same picture.
+# With AVX-512, libLLVM 15 and 16 kill Dr.Jit 1.5 (at `fmaximum`). 17, 18, 19 and 22 rendered the same picture.
 MIN_VERSION = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 NEED = f"Dr.Jit needs {MIN_VERSION} or later to compile for the CPU"
 
-# Where distributions put the library when the dynamic linker does not know of it.
+# Where distributions install libLLVM outside the search path of the dynamic linker.
 PATTERNS = (
     "/usr/lib/*-linux-gnu/libLLVM*",
     "/usr/lib/llvm*/lib*/libLLVM*",
@@ -34,7 +34,8 @@ PATTERNS = (
     "/opt/local/libexec/llvm*/lib/libLLVM*",
 )
 
-# libLLVM-15.so.1, libLLVM.so.19.1, libLLVM-14.0.6.so, libLLVM.dylib; not libLLVM-C.so nor libLLVM-15-rust.so.
+# Matches libLLVM-15.so.1, libLLVM.so.19.1, libLLVM-14.0.6.so and libLLVM.dylib, but not libLLVM-C.so and
+# libLLVM-15-rust.so.
 _NAME = re.compile(r"libLLVM(-\d+[\d.]*)?\.(so|dylib)[\d.]*")
 _NUMBER = re.compile(r"(?:libLLVM-|libLLVM\.so\.|llvm[-@/]?)(\d+)")
 
@@ -43,13 +44,13 @@ _INSTALL = {
     "fedora": "sudo dnf install llvm-libs",
     "arch": "sudo pacman -S llvm-libs",
     "macos": "brew install llvm",
-    # Dr.Jit would take an LLVM-C.dll there, but nothing else of this package was ever tried.
+    # Dr.Jit could use LLVM-C.dll there, but this package was never tried on Windows.
     "windows": "wsl --install (Windows is not supported, Linux in its WSL is)",
 }
 
 
 def platform() -> str:
-    """Whose package manager this system has: debian (also Ubuntu), fedora, arch, macos, or other; or windows."""
+    """The system, by its package manager: debian (includes Ubuntu), fedora, arch, macos, windows or other."""
     if sys.platform in ("darwin", "win32"):
         return "macos" if sys.platform == "darwin" else "windows"
     try:
@@ -62,12 +63,15 @@ def platform() -> str:
 
 
 def install_command() -> str:
-    """What to type here to get a new enough libLLVM."""
+    """The command that installs a new enough libLLVM on this system."""
     return _INSTALL.get(platform(), f"install libLLVM {MIN_VERSION} or later and point {VARIABLE} to it")
 
 
 def version(path: str) -> int | None:
-    """Major version of the library at `path`, 0 if too old to tell (before 16), None if it does not load."""
+    """The major version of the libLLVM at `path`.
+
+    It is 0 if the libLLVM is too old to tell its version (before 16), and None if it cannot be loaded.
+    """
     try:
         library = ctypes.CDLL(path)
     except OSError:
@@ -82,13 +86,13 @@ def version(path: str) -> int | None:
 
 
 def _version_of_name(path: str) -> int:
-    """Major version that the resolved file name or its folders state, 0 if they state none."""
+    """The major version in the resolved path of the file, or 0 if the path states none."""
     numbers = _NUMBER.findall(os.path.realpath(path))
     return int(numbers[-1]) if numbers else 0
 
 
 def _folders_of_user() -> list[str]:
-    """Folders that the environment adds to the search."""
+    """The folders that environment variables add to the search."""
     variables = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH")
     folders = [folder for name in variables for folder in os.environ.get(name, "").split(os.pathsep)]
     prefix = os.environ.get("CONDA_PREFIX")
@@ -96,7 +100,7 @@ def _folders_of_user() -> list[str]:
 
 
 def candidates() -> list[str]:
-    """Paths of this system's libLLVMs, one per file, newest first going by their names."""
+    """The paths of all libLLVM files of this system, without duplicates, newest first according to their names."""
     patterns = (*PATTERNS, *(f"{folder}/libLLVM*" for folder in _folders_of_user()))
     paths = [path for pattern in patterns for path in glob.glob(pattern)]
     search = os.pathsep.join((os.environ.get("PATH", ""), "/sbin", "/usr/sbin"))
@@ -109,7 +113,7 @@ def candidates() -> list[str]:
 
 @cache
 def _examine(path: str) -> tuple[int | None, str]:
-    """Version of the library at `path`, and what is wrong with it ("" if nothing is)."""
+    """The version of the libLLVM at `path`, and a sentence on its fault ("" if it is usable)."""
     found = version(path)
     if found is None:
         return None, f"{path} is no libLLVM that can be loaded"
@@ -121,7 +125,7 @@ def _examine(path: str) -> tuple[int | None, str]:
 
 @cache
 def _newest() -> tuple[str, int, str]:
-    """Path and version of the newest library that loads, and what is wrong with it."""
+    """The path and the version of the newest libLLVM that can be loaded, and a sentence on its fault ("" if none)."""
     for path in candidates():
         found, fault = _examine(path)
         if found is not None:
@@ -130,9 +134,10 @@ def _newest() -> tuple[str, int, str]:
 
 
 def find() -> tuple[str, int]:
-    """Path and major version of the libLLVM to use: what DRJIT_LIBLLVM_PATH names, else the system's newest.
+    """The path and the major version of the libLLVM to use.
 
-    Raises `MissingDependencyError` with what to do, if there is none or it is too old.
+    This is the file that DRJIT_LIBLLVM_PATH names, or else the newest on the system. Raises `MissingDependencyError`,
+    which says what to do, if there is none or it is too old.
     """
     if chosen := os.environ.get(VARIABLE):
         found, fault = _examine(chosen)
@@ -147,10 +152,11 @@ def find() -> tuple[str, int]:
 
 
 def ensure_llvm() -> None:
-    """Makes sure that Dr.Jit compiles with a libLLVM it works with; to be called before the first CPU kernel.
+    """Makes sure that Dr.Jit uses a libLLVM it works with. Call it before the first CPU kernel.
 
-    Dr.Jit loads the library when it is first imported. Before that, this sets DRJIT_LIBLLVM_PATH unless the
-    user did; after that, it asks Dr.Jit what it loaded. Raises `MissingDependencyError` if that will not do.
+    Dr.Jit loads libLLVM when it is first imported. Before that import, this function sets DRJIT_LIBLLVM_PATH, unless
+    the user has set it. After the import, it asks Dr.Jit which libLLVM is loaded. Raises `MissingDependencyError` if
+    there is no usable libLLVM, or if Dr.Jit has loaded one that is too old.
     """
     if "drjit" in sys.modules:
         _check_loaded()
@@ -161,7 +167,7 @@ def ensure_llvm() -> None:
 def _check_loaded() -> None:
     import drjit
 
-    major = drjit.detail.llvm_version()[0]  # -1 if it found no library
+    major = drjit.detail.llvm_version()[0]  # -1 if Dr.Jit has found no libLLVM
     if major >= MIN_VERSION:
         return
     loaded = f"libLLVM {major}, which is too old ({NEED})" if major > 0 else "no libLLVM"
@@ -171,14 +177,14 @@ def _check_loaded() -> None:
 
 
 def _missing(message: str) -> Exception:
-    # Not imported above, because this file must run before the package is installed.
+    # Imported only here, because this file must run before the package is installed.
     from nma.errors import MissingDependencyError
 
     return MissingDependencyError(message)
 
 
 def main() -> int:
-    """Prints the library in use, or what is wrong; exit status 0 or 1."""
+    """Prints the path of the libLLVM in use and returns 0, or prints what is wrong and returns 1."""
     chosen = os.environ.get(VARIABLE)
     path, fault = (chosen, _examine(chosen)[1]) if chosen else (_newest()[0], _newest()[2])
     print(fault or path)

@@ -1,8 +1,8 @@
 """GGX microfacets and Fresnel reflectance, shared by the sources and by the target (CONVENTIONS.md).
 
-Directions are `Vec3` in the local frame, z up, pointing away from the surface. `alpha` is the microfacet width; the
-anisotropic forms take one width along x and one along y. Nothing here branches: all functions run on Dr.Jit, JAX and
-NumPy.
+Directions are unit vectors (`Vec3`) in the local frame, with z up, and point away from the surface. `alpha` is the
+microfacet width. Anisotropic functions take one width along x and one along y. No function branches on values, so all
+of them run on Dr.Jit, JAX and NumPy.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from nma.ops import Color, Float, Vec3
 
 
 def ggx_d(m: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
-    """Density of microfacet normals per solid angle, times 1 over projected area [1/sr]. Heitz 2014, eq. 84.
+    """GGX distribution D(m) [1/sr]: the area of microfacets with normal `m` per solid angle and unit of surface area.
 
-    Written with the slopes m.x / alpha, m.y / alpha rather than 1 - cos^2: near the peak of a narrow lobe the latter
-    loses all digits in single precision.
+    Heitz 2014, eq. 84. It is written with the slopes m.x / alpha_x and m.y / alpha_y. Near the peak of a narrow lobe,
+    1 - cos^2 would lose all digits in single precision.
     """
     sx = m.x / alpha_x
     sy = m.y / alpha_y
@@ -24,7 +24,10 @@ def ggx_d(m: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
 
 
 def smith_g1(v: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
-    """Fraction of microfacets seen from direction `v` (either side): Smith masking. Heitz 2014, eq. 72 and 86."""
+    """Smith masking G1: the visible fraction of the microfacets that face `v`. Heitz 2014, eq. 72 and 86.
+
+    `v` may lie on either side of the surface.
+    """
     sx = alpha_x * v.x
     sy = alpha_y * v.y
     z2 = v.z * v.z
@@ -32,32 +35,33 @@ def smith_g1(v: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
 
 
 def visible_normal_pdf(wi: Vec3, m: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
-    """Density of normals `m` as seen from `wi` (wi.z > 0) [1/sr]. Heitz 2018, eq. 1."""
+    """Density [1/sr] of the normals `m` that are visible from `wi` (wi.z > 0). Heitz 2018, eq. 1."""
     visible = ops.maximum(ops.dot(wi, m), 0.0)
     return smith_g1(wi, alpha_x, alpha_y) * ggx_d(m, alpha_x, alpha_y) * visible / wi.z
 
 
 def sample_visible_normal(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) -> Vec3:
-    """Draws a normal from `visible_normal_pdf`, wi.z > 0. Dupuy and Benyoub 2023, listing 1 (spherical caps)."""
+    """Draws a normal with the density `visible_normal_pdf`, for wi.z > 0. Dupuy and Benyoub 2023, listing 1."""
     wi_std = ops.normalize(Vec3(alpha_x * wi.x, alpha_y * wi.y, wi.z))
-    # A uniform point on the cap of directions that reflect wi_std into the upper hemisphere ...
+    # Draw a uniform point on the spherical cap of directions that reflect wi_std into the upper hemisphere.
     phi = (2.0 * ops.PI) * u1
     z = 1.0 - u2 * (1.0 + wi_std.z)
     sin_theta = ops.safe_sqrt(1.0 - z * z)
-    # ... whose half vector with wi_std is a visible normal of the unit hemisphere; stretch it back.
+    # The half vector of this point and wi_std is a visible normal of the unit hemisphere. Stretch it back.
     m_std = Vec3(sin_theta * ops.cos(phi), sin_theta * ops.sin(phi), z) + wi_std
     return ops.normalize(Vec3(alpha_x * m_std.x, alpha_y * m_std.y, ops.maximum(m_std.z, 1e-9)))
 
 
 def reflect(w: Vec3, m: Vec3) -> Vec3:
-    """Mirror image of `w` about the normal `m`."""
+    """The mirror image of `w` about the normal `m`."""
     return m * (2.0 * ops.dot(w, m)) - w
 
 
 def refract(w: Vec3, m: Vec3, cos_t: Float, eta: Float) -> Vec3:
-    """Direction beyond the facet `m` for `w` on its side (w.m > 0). Walter 2007, eq. 40.
+    """The direction `w` refracted at a facet with normal `m` (w.m > 0). Walter 2007, eq. 40.
 
-    `eta` is the index beyond over the index on `w`'s side, `cos_t` the cosine of refraction from `fresnel_dielectric`.
+    `eta` is the index of refraction beyond the facet divided by the index on `w`'s side. `cos_t` is the cosine of
+    refraction, from `fresnel_dielectric`.
     """
     return m * (ops.dot(w, m) / eta - cos_t) - w * (1.0 / eta)
 
@@ -65,7 +69,8 @@ def refract(w: Vec3, m: Vec3, cos_t: Float, eta: Float) -> Vec3:
 def fresnel_dielectric(cos_i: Float, eta: Float) -> tuple[Float, Float]:
     """Unpolarised reflectance and cosine of refraction for cos_i >= 0; (1, 0) at total internal reflection.
 
-    `eta` is the index beyond over the index on the incident side. Walter 2007, section 5.2, in its s and p form.
+    `eta` is the index of refraction beyond the surface divided by the index on the incident side. Walter 2007, section
+    5.2, written for s and p polarisation.
     """
     cos2_t = 1.0 - (1.0 - cos_i * cos_i) / (eta * eta)
     cos_t = ops.safe_sqrt(cos2_t)
@@ -75,9 +80,9 @@ def fresnel_dielectric(cos_i: Float, eta: Float) -> tuple[Float, Float]:
 
 
 def fresnel_conductor(cos_i: Float, eta: Float, k: Float) -> Float:
-    """Unpolarised reflectance of a conductor with relative index eta + i k (one channel), cos_i >= 0.
+    """Unpolarised reflectance of a conductor with relative index eta + i k, in one channel, for cos_i >= 0.
 
-    Born and Wolf 1999, section 14.2, solved for real arithmetic.
+    Born and Wolf 1999, section 14.2, written in real numbers.
     """
     cos2 = cos_i * cos_i
     sin2 = 1.0 - cos2
@@ -87,12 +92,12 @@ def fresnel_conductor(cos_i: Float, eta: Float, k: Float) -> Float:
     t1 = a2b2 + cos2
     t2 = 2.0 * cos_i * a
     r_s = (t1 - t2) / (t1 + t2)
-    t3 = cos2 * a2b2 + sin2 * sin2 + 1e-30  # an index of 0 + 0i reflects everything, at normal incidence too
+    t3 = cos2 * a2b2 + sin2 * sin2 + 1e-30  # 1e-30: an index of 0 + 0i reflects all light
     t4 = t2 * sin2
     r_p = r_s * ((t3 - t4) / (t3 + t4))
     return 0.5 * (r_s + r_p)
 
 
 def fresnel_conductor_rgb(cos_i: Float, eta: Color, k: Color) -> Color:
-    """`fresnel_conductor` for each channel."""
+    """`fresnel_conductor` of each colour channel."""
     return Color(*(fresnel_conductor(cos_i, e, kk) for e, kk in zip(eta, k, strict=True)))

@@ -14,25 +14,30 @@ from nma import ops
 from nma.errors import NmaError
 from nma.ops import Float
 
-# Share of He's random matrix in hidden layers that start near the identity.
+# A hidden layer that starts near the identity is the identity plus this factor times He's random matrix.
 _MIXING = 0.25
 
-# Far beyond what a renderer can run for each shading point.
+# Limits of a network's size. A renderer could not run such a network at every shading point.
 _MOST_LAYERS, _MOST_NEURONS = 64, 1024
 
 Layers = list[tuple[Any, Any]]  # (matrix (out, in), bias (out,)) per layer
 _Activation = Callable[[Float], Float]
 
-# Sums in a dot product of `forward_lanes`: a query of a 5x64 network took .56 us of a Zen 4 core, with one .70.
+# `forward_lanes` splits a dot product into this many sums. A query of a 5x64 network took .56 us on a Zen 4 core with
+# 4 sums, and .70 us with one.
 _SUMS = 4
-# Neurons of `forward_lanes` whose sums AVX-512 keeps in its 32 registers: a query of a 5x64 network took .34 us of an
-# Intel Xeon (family 6, model 167), without blocks .47. With the 16 registers of AVX2, blocks make it no faster.
+# With AVX-512, `forward_lanes` computes the neurons in blocks of this many, whose sums fit in the 32 registers. A query
+# of a 5x64 network took .34 us on an Intel Xeon (family 6, model 167) with blocks, and .47 us without. With the 16
+# registers of AVX2, blocks bring no gain.
 _BLOCK = 28
 
 
 def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | None = None) -> Layers:
-    """Random layers: He 2015 initialisation, with hidden layers of equal width starting near the identity, so that a
-    deep network starts out as easy to train as a shallow one; the last layer starts small around `output_bias`."""
+    """Random layers of the given `sizes` (inputs, hidden layers, outputs), initialised as in He 2015.
+
+    A layer with as many inputs as outputs starts near the identity. This makes a deep network as easy to train as a
+    shallow one. The last layer has small weights and the bias `output_bias` (outputs,), or 0.
+    """
     layers: Layers = []
     for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
         matrix = rng.standard_normal((fan_out, fan_in)) * np.sqrt(2.0 / fan_in)
@@ -45,7 +50,7 @@ def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | 
 
 
 def forward(layers: Layers, x: Any) -> Any:
-    """Outputs (n, out) for inputs (n, in), on NumPy or JAX."""
+    """The outputs (n, out) of the network for the inputs `x` (n, in), in NumPy or JAX."""
     for matrix, bias in layers[:-1]:
         x = ops.maximum(x @ matrix.T + bias, 0.0)
     matrix, bias = layers[-1]
@@ -55,11 +60,12 @@ def forward(layers: Layers, x: Any) -> Any:
 def forward_lanes(
     layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float], active: Any = True
 ) -> list[Float]:
-    """Outputs for one input per list entry, on Dr.Jit: the network unrolled into the kernel, weights as literals.
+    """The outputs of the network in Dr.Jit. `x` has one array per input, and the result has one array per output.
 
-    Inside a renderer's virtual functions this is the fast way: on LLVM, weights in memory, as `drjit.nn` has them, are
-    gathered there lane by lane, which takes ten times as long. Packets without an `active` lane skip the network and
-    return zeros: a renderer calls the only BSDF of a scene for rays that met nothing, too.
+    The network is unrolled into the kernel, with its weights as literals. This is the fast way inside a renderer's
+    virtual functions. There, weights in memory, as in `drjit.nn`, are gathered lane by lane on LLVM, which takes ten
+    times as long. A packet without any `active` lane skips the network and returns zeros. This helps because a renderer
+    calls the only BSDF of a scene even for rays that hit nothing.
     """
     import drjit as dr
 
@@ -91,7 +97,10 @@ def _unrolled(layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float]) -> 
 def _by_neuron(
     matrix: list[list[float]], bias: list[float], x: Sequence[Float], activation: _Activation
 ) -> list[Float]:
-    """Each dot product as a few independent sums: in a single one each multiplication waits for the one before it."""
+    """A layer, neuron by neuron. Each dot product is split into independent sums.
+
+    In a single sum, every multiplication would have to wait for the previous one.
+    """
     import drjit as dr
 
     outputs = []
@@ -109,8 +118,11 @@ def _by_neuron(
 def _in_blocks(
     matrix: list[list[float]], bias: list[float], x: Sequence[Float], activation: _Activation
 ) -> list[Float]:
-    """Blocks of neurons whose sums stay in registers while one input after the other is added: an input is fetched once
-    for a block. Dr.Jit orders what it compiles by its needs, but for scopes, which it leaves in their order."""
+    """A layer, in blocks of neurons. The sums of a block stay in registers while the inputs are added one by one.
+
+    So every input is loaded once per block. Dr.Jit may reorder operations, but it keeps the order of scopes. A new
+    scope for each input therefore keeps the inputs in order.
+    """
     import drjit as dr
 
     outputs: list[Float] = []
@@ -126,7 +138,7 @@ def _in_blocks(
 
 
 def _many_registers(value: Float) -> bool:
-    """Whether kernels for this array have the 32 vector registers of AVX-512."""
+    """Whether kernels for arrays of this type can use the 32 vector registers of AVX-512."""
     import drjit as dr
 
     core: Any = (
@@ -137,12 +149,15 @@ def _many_registers(value: Float) -> bool:
 
 
 def parameters(layers: Layers) -> int:
-    """Number of trainable numbers."""
+    """The number of trainable parameters."""
     return sum(m.size + b.size for m, b in layers)
 
 
 def hidden(name: str) -> list[int]:
-    """Hidden layer sizes of a network named like "5x64"."""
+    """The widths of the hidden layers of a network with a name such as "5x64".
+
+    Raises `NmaError` if the name is malformed or the network is too large.
+    """
     found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", name, re.ASCII)
     depth, width = (int(number) for number in found.groups()) if found else (0, 0)
     if not (0 < depth <= _MOST_LAYERS and 0 < width <= _MOST_NEURONS):

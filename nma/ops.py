@@ -1,8 +1,8 @@
-"""Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written once (CONVENTIONS.md).
+"""Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written only once (CONVENTIONS.md).
 
-Each function looks at its arguments and calls the library they belong to; plain Python numbers give plain Python
-numbers. Code built on this module never branches on values: it uses `select`. `Vec3` is a triple of such arrays, a
-direction or an RGB colour.
+A function looks at the types of its arguments and calls the array package that they belong to. Plain Python numbers
+give plain Python numbers. Code that uses this module must not branch on values; it calls `select` instead. A `Vec3` is
+a triple of arrays: a direction or an RGB colour.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ INV_PI = 1.0 / math.pi
 
 
 class _Python:
-    """NumPy's operations on plain Python numbers, without its scalar types: those capture other libraries' arrays."""
+    """NumPy's operations on plain Python numbers, with plain Python numbers as results.
+
+    NumPy's own scalars would take over the arithmetic with arrays of Dr.Jit or JAX.
+    """
 
     __name__ = "python"
 
@@ -63,7 +66,7 @@ def sqrt(x: Float) -> Float:
 
 
 def safe_sqrt(x: Float) -> Float:
-    """sqrt(max(x, 0)) whose derivative at 0 is 0 instead of infinite."""
+    """sqrt(max(x, 0)), with the derivative 0 for x <= 0. The derivative of a plain root would be infinite at 0."""
     positive = x > 0
     return select(positive, sqrt(select(positive, x, 1.0)), 0.0)
 
@@ -82,7 +85,7 @@ def log1p(x: Float) -> Float:
 
 
 def sigmoid(x: Float) -> Float:
-    """1 / (1 + exp(-x)), as a tangent so that neither value nor derivative overflows."""
+    """1 / (1 + exp(-x)), written with tanh so that neither the value nor the derivative overflows."""
     return 0.5 + 0.5 * tanh(0.5 * x)
 
 
@@ -133,7 +136,7 @@ def floor(x: Float) -> Float:
 
 
 def select(condition: Mask, a: Float, b: Float) -> Float:
-    """`a` where the condition holds, else `b`. Works on a `Vec3` too."""
+    """`a` where the condition holds, else `b`. Both may be numbers or `Vec3`."""
     if isinstance(a, Vec3) or isinstance(b, Vec3):
         a, b = Vec3.of(a), Vec3.of(b)
         return Vec3(*(select(condition, p, q) for p, q in zip(a, b, strict=True)))
@@ -146,7 +149,7 @@ def copysign(magnitude: Float, sign: Float) -> Float:
 
 
 def detach(x: Float) -> Float:
-    """The value without its derivative."""
+    """The value of `x` as a constant, through which no derivative is propagated."""
     owner = library(x)
     if owner == "drjit":
         import drjit
@@ -172,7 +175,7 @@ class Vec3(NamedTuple):
 
     @staticmethod
     def of(value: Float | Vec3) -> Vec3:
-        """`value` itself if it is a `Vec3`, else the grey triple (value, value, value)."""
+        """Returns `value` if it is a `Vec3`, else the triple (value, value, value)."""
         return value if isinstance(value, Vec3) else Vec3(value, value, value)
 
     def __add__(self, other):
@@ -229,10 +232,10 @@ def max_component(c: Vec3) -> Float:
 
 
 def mean(c: Vec3) -> Float:
-    """Mean of the three components."""
+    """The mean of the three components."""
     return (c.x + c.y + c.z) * (1.0 / 3.0)
 
 
 def luminance(c: Vec3) -> Float:
-    """Luminance of linear sRGB (ITU-R BT.709 primaries)."""
+    """The luminance of a linear sRGB colour (ITU-R BT.709 primaries)."""
     return 0.212671 * c.x + 0.715160 * c.y + 0.072169 * c.z

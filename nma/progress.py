@@ -1,4 +1,4 @@
-"""Progress bars on stderr, of commands and of whatever takes minutes in Python."""
+"""Progress bars on stderr, for commands and for Python calls that take minutes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ err = Console(stderr=True)
 
 
 def progress(unit: str) -> Progress:
-    """A progress bar with a rate in `unit` (the field `rate`), a note (the field `note`) and the time left."""
+    """A progress bar that shows a rate in `unit` (task field `rate`), a note (task field `note`) and the time left."""
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -37,7 +37,7 @@ def progress(unit: str) -> Progress:
 
 
 class TrainingBar:
-    """A progress bar that shows the loss over the last steps and bins per second."""
+    """A progress bar for training that shows the mean loss of the last 500 steps and the bins per second."""
 
     def __init__(self, recipe: Any, title: str = "training"):
         self._bar, self._recipe, self._title = progress("Mbins/s"), recipe, title
@@ -68,7 +68,11 @@ class TrainingBar:
 def of_training(
     given: Callable[[Any], None] | None, recipe: Any, title: str = "training"
 ) -> Iterator[Callable[[Any], None]]:
-    """What to call as training goes on: what was given, else a bar where stderr is a terminal, else nothing."""
+    """Yields the function that training calls with its progress.
+
+    This is `given`, if there is one. Otherwise the function updates a progress bar if stderr is a terminal, and does
+    nothing if it is not.
+    """
     if given is not None:
         yield given
     elif not sys.stderr.isatty():

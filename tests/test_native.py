@@ -94,7 +94,7 @@ def test_python_reaches_the_batched_kernel(tmp_path):
         Runtime(tmp_path / "none.safetensors")
     with pytest.raises(nma.errors.ParamError, match="no instruction set 'mmx'"):
         Runtime("layered3-3x32", "mmx")
-    with pytest.raises(nma.errors.ParamError, match=r"params wants shape \(n, 13\), got \(13,\)"):
+    with pytest.raises(nma.errors.ParamError, match=r"params must have shape \(n, 13\), got \(13,\)"):
         runtime.prepare(params[0], cosines[:1])
     with pytest.raises(nma.errors.ParamError, match="500 rows of params for 499 cosines"):
         runtime.prepare(params, cosines[1:])

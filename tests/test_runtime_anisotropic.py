@@ -139,7 +139,7 @@ def test_cosines_and_other_shapes_are_refused(case):
     for call in (runtime.prepare, runtime.outputs):
         with pytest.raises(ParamError, match=r"give wi of shape \(n, 3\), not cosines \(4000,\)"):
             call(none(), wi[:, 2])
-        with pytest.raises(ParamError, match=r"wi wants shape \(n, 3\), got \(4000, 2\)"):
+        with pytest.raises(ParamError, match=r"wi must have shape \(n, 3\), got \(4000, 2\)"):
             call(none(), wi[:, :2])
         with pytest.raises(ParamError, match="4000 rows of params for 3999 directions"):
             call(none(), wi[1:])

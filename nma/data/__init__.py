@@ -1,4 +1,4 @@
-"""Data shipped with the package."""
+"""The data that is shipped with the package: indices of refraction of conductors."""
 
 import csv
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ __all__ = ["Conductors", "load_conductors"]
 
 @dataclass(frozen=True)
 class Conductors:
-    """Complex indices of refraction eta + i k of real conductors, as linear sRGB.
+    """Complex indices of refraction eta + i k of real conductors, in linear sRGB.
 
-    `names` has n entries; `eta` (.038 .. 7.51) and `k` (.114 .. 9.22) are (n, 3) float64, unitless;
-    `held_out` is (n,) bool, true for the metals that training never sees. Arrays are read-only.
+    `names` has n entries. `eta` (.038 .. 7.51) and `k` (.114 .. 9.22) are (n, 3) float64, unitless. `held_out` is (n,)
+    bool, true for the metals that training never sees. The arrays are read-only.
     """
 
     names: tuple[str, ...]
@@ -27,14 +27,14 @@ class Conductors:
         return len(self.names)
 
     def distinct(self) -> np.ndarray:
-        """Ascending numbers of one row per different (eta, k): the corpus holds some substances twice."""
+        """Row numbers, ascending, such that every different (eta, k) occurs once: some rows have equal numbers."""
         _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
         return np.sort(first)
 
 
 @cache
 def load_conductors() -> Conductors:
-    """The metals of `conductors.csv` (Mitsuba's data/ior; see tools/make_conductors.py), in file order."""
+    """The metals of `conductors.csv`, in file order. tools/make_conductors.py made it from Mitsuba's data/ior."""
     lines = files(__name__).joinpath("conductors.csv").read_text(encoding="utf-8").splitlines()
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
 

@@ -4,7 +4,7 @@ from nma.export.classes import classes
 from nma.export.cpp import cpp
 from nma.export.shared import shared
 
-# The generated files of `runtime/`, and what prints them.
+# The generated files of `runtime/`, each with the function that returns its content.
 FILES = {"nma/target.h": cpp, "nma/classes.h": classes, "nma/constants.h": shared}
 
 __all__ = ["FILES"]

@@ -1,7 +1,7 @@
-"""Which functions, structures and constants make up the target, as syntax trees in the order of their use.
+"""The functions, structures and constants of the target, as syntax trees. A function comes after those it calls.
 
-All are written in a subset of Python that every shading language has: assignments of expressions to names, arithmetic,
-comparisons, calls, fields, and one return at the end. Anything else is refused with its file and line.
+They are written in the part of Python that every shading language has, too: assignments of expressions to names,
+arithmetic, comparisons, calls, fields, and one return at the end. Anything else raises an error with its file and line.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STRUCTURES: tuple[type, ...] = (
     albedo.Albedos,
     plane.Plane,
 )
-# Callers stand after what they call. A method `of` of the structure `Plane` becomes the function `plane_of`.
+# A function comes after those it calls. The method `of` of the structure `Plane` becomes the function `plane_of`.
 FUNCTIONS: tuple[Callable, ...] = (
     microfacet.ggx_d,
     microfacet.smith_g1,
@@ -65,12 +65,12 @@ FUNCTIONS: tuple[Callable, ...] = (
 
 
 class Unsupported(NmaError):
-    """A construct that the exported languages do not have."""
+    """A Python construct that cannot be exported to other languages."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """A function's syntax: arguments and return value as their annotations have them, and its statements."""
+    """A parsed function: its arguments (name, annotation), the annotation of its result, and its statements."""
 
     name: str
     doc: str
@@ -88,13 +88,13 @@ class Function:
 
 @cache
 def functions() -> tuple[Function, ...]:
-    """All of `FUNCTIONS`."""
+    """All of `FUNCTIONS`, parsed."""
     return tuple(parsed(function) for function in FUNCTIONS)
 
 
 @cache
 def constants() -> dict[str, float]:
-    """Numbers that the functions refer to by name, from whichever module defines them."""
+    """The global numbers that the functions use, by name."""
     found = {}
     for function in functions():
         for name in _names(function):
@@ -105,25 +105,25 @@ def constants() -> dict[str, float]:
 
 
 def structures() -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
-    """Name, docstring and fields (name, type) of every structure."""
+    """Yields the name, the docstring and the fields (name, type) of every structure."""
     for structure in STRUCTURES:
         yield structure.__name__, inspect.getdoc(structure) or "", fields(structure)
 
 
 def fields(structure: type) -> list[tuple[str, str]]:
-    """Names and types of a structure's fields."""
+    """The names and the types of a structure's fields."""
     hints = structure.__annotations__.items()
     return [(name, str(getattr(hint, "__forward_arg__", hint))) for name, hint in hints]
 
 
 def _names(function: Function) -> list[str]:
-    """Every name that a function reads, in order."""
+    """All names in a function's statements, in order."""
     module = ast.Module(function.body, [])
     return [node.id for node in ast.walk(module) if isinstance(node, ast.Name)]
 
 
 def parsed(function: Callable) -> Function:
-    """The syntax tree with the line numbers of the file."""
+    """Parses a function. The nodes of its syntax tree have the line numbers of the file."""
     lines, first = inspect.getsourcelines(function)
     tree = ast.parse(textwrap.dedent("".join(lines))).body[0]
     ast.increment_lineno(tree, first - 1)

@@ -1,4 +1,4 @@
-"""A Principled BRDF as Mitsuba's own plugin `principled`: a dictionary for `mi.load_dict`, or XML."""
+"""A Principled BRDF as a description of Mitsuba's own plugin `principled`: a dictionary for `mi.load_dict`, or XML."""
 
 from __future__ import annotations
 
@@ -7,33 +7,36 @@ from typing import Any
 from nma.errors import ParamError
 from nma.target.principled import Principled, specular_eta
 
-# Mitsuba's names are ours. `specular` may become `eta`.
+# The parameters, which have the same names in Mitsuba. `specular` may be replaced by `eta`.
 _FIELDS = (
     *("roughness", "metallic", "specular", "spec_tint", "sheen", "sheen_tint"),
     *("clearcoat", "clearcoat_gloss", "anisotropic", "flatness"),
 )
-# Significant digits: about those of single precision, in which Mitsuba reads them.
+# The number of significant digits. Mitsuba reads numbers in single precision, which has about as many.
 _DIGITS = 7
-# What `specular` and `eta` say for a dielectric without reflection: at an eta of 1, Mitsuba 3.9 drops metals, too.
+# A dielectric without reflection gets this `eta`, and a `specular` below this minimum counts as 0. With an eta of 1,
+# Mitsuba 3.9 would leave out the reflection of metals, too.
 _MIN_SPECULAR, _MIN_ETA = 1e-6, 1.00001
 
 
 def principled_dict(p: Principled) -> dict[str, Any]:
-    """The dictionary of `p`, whose parameters are plain numbers.
+    """The dictionary for `p`, whose parameters are plain numbers.
 
-    It is one-sided, as Mitsuba's plugin is without `spec_trans`; wrap it in `twosided` for surfaces seen from behind.
-    A `specular` above 1, where Mitsuba's ends, or of 0, for which Mitsuba leaves out metals, too, is written as the
-    `eta` with the same reflectance. The plugin evaluates to what `nma.target.eval_principled` does, but for the
-    differences in the head of nma/target/principled.py. Raises `ParamError` for parameters that it does not have or
-    allow.
+    The BSDF is one-sided, as Mitsuba's plugin is without `spec_trans`. Wrap it in `twosided` for surfaces seen from
+    behind. The plugin returns the same values as `nma.target.eval_principled`, with the exceptions listed at the top of
+    nma/target/principled.py.
+
+    In two cases `specular` is replaced by the `eta` with the same reflectance: above 1, which is Mitsuba's limit, and
+    at 0, where Mitsuba would leave out the reflection of metals. Raises `ParamError` for parameters that the plugin
+    does not have, and for values that it does not allow.
     """
     values = {name: float(getattr(p, name)) for name in _FIELDS}
     base_color = [float(c) for c in p.base_color]
     unknown = set(p._fields) - {"base_color", *_FIELDS}
     if used := sorted(name for name in unknown if float(getattr(p, name)) != 0.0):
-        raise ParamError(f"Mitsuba's principled has no {', '.join(used)}; set to 0 what it shall do without")
+        raise ParamError(f"Mitsuba's principled has no {', '.join(used)}; set it to 0")
     for name, value in (*values.items(), *(("base_color", c) for c in base_color)):
-        # From 12.5 on there is no such index of refraction.
+        # No index of refraction has a `specular` of 12.5 or more.
         high = 12.0 if name == "specular" else 1.0
         if not 0.0 <= value <= high:
             raise ParamError(f"{name} is {value:g}, Mitsuba's principled allows 0 .. {high:g}")
@@ -46,7 +49,7 @@ def principled_dict(p: Principled) -> dict[str, Any]:
 
 
 def principled_xml(p: Principled) -> str:
-    """The same as an XML file whose outermost element is <bsdf>."""
+    """`principled_dict` as the text of an XML file whose outermost element is <bsdf>."""
     description = principled_dict(p)
     lines = [f'<bsdf version="3.0.0" type="{description.pop("type")}">']
     colour = " ".join(map(repr, description.pop("base_color")["value"]))

@@ -1,1 +1,1 @@
-"""The C++ runtime from Python: what compiles it, and what calls it."""
+"""The C++ runtime from Python: `build` compiles it, `runtime` calls it."""

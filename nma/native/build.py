@@ -1,9 +1,10 @@
-"""The C++ runtime, compiled on this machine when it is wanted: plugins for Mitsuba's scalar renderer, and the library
-that Python calls for many queries at once.
+"""Compiles the C++ runtime on this machine: the plugins for Mitsuba's scalar renderer, and the shared library that
+`nma.native.runtime` calls.
 
-What is built lies in the user's cache, in a folder named by the digest of the sources and of all versions that matter:
-a newer package or Mitsuba builds anew and never loads what does not fit it. Compilers: `CXX`, else c++, g++ or clang++.
-Linux is tested, macOS is meant to work, Windows is refused.
+The result is kept in the user's cache folder. The name of its subfolder has a digest of the C++ sources and of the
+versions they are compiled against. So a newer version of this package or of Mitsuba compiles again, and never loads
+files that do not fit. The compiler is the one named in `CXX`, else c++, g++ or clang++. Linux is tested, macOS should
+work, and Windows is refused.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from nma.files import whole_folder
 
 PLUGINS = ("nma", "layered")
 _ADAPTERS = Path(__file__).parent.parent / "adapter" / "trained"
-# Those of Mitsuba's wheel. How vectors are passed depends on the instruction set: with another one, plugins load
-# and return nonsense.
+# The flags with which Mitsuba's wheel was compiled. Function calls pass vectors differently for each instruction set: a
+# plugin compiled for another one loads, but returns nonsense.
 _MITSUBA_FLAGS = (
     *(["-march=haswell"] if platform.machine() in ("x86_64", "AMD64") else []),
     *("-std=c++20", "-O2", "-fPIC", "-shared", "-fvisibility=hidden"),
@@ -35,11 +36,11 @@ _MITSUBA_FLAGS = (
 
 
 class BuildError(NmaError, RuntimeError):
-    """The compiler refused; the message holds its first words."""
+    """The compiler failed. The message has its first errors."""
 
 
 def sources() -> Path:
-    """The folder of the C++ runtime: of a checkout, or as the wheel has it."""
+    """The folder with the sources of the C++ runtime, in a checkout or in an installed wheel."""
     package = Path(__file__).parent
     for folder in (package / "cpp", package.parent.parent / "runtime"):
         if (folder / "nma.h").exists():
@@ -48,26 +49,27 @@ def sources() -> Path:
 
 
 def mitsuba_folder() -> Path:
-    """Where the plugins for the installed Mitsuba are, or will be: a folder for its resource path."""
+    """The folder of the plugins for the installed Mitsuba, to be put on its resource path. It may not exist yet."""
     return _cache() / f"mitsuba-{_digest('mitsuba', 'drjit')}"
 
 
 def has_mitsuba_plugins() -> bool:
+    """Whether the plugins for the installed Mitsuba are compiled."""
     return mitsuba_folder().exists()
 
 
 def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
-    """Compiles the plugins `nma` and `layered` for `scalar_rgb` against the installed Mitsuba, unless they are there.
+    """Compiles the plugins `nma` and `layered` for `scalar_rgb` against the installed Mitsuba, unless that is done.
 
     Args:
-        say: is told of each step.
+        say: a function that is called with a line of text for each step.
 
     Returns:
-        The folder to put on Mitsuba's resource path; shipped adapters lie in it too.
+        The folder to put on Mitsuba's resource path. It also has the shipped adapters.
 
     Raises:
-        MissingDependencyError: no compiler, or no headers of nanobind, which Dr.Jit's include.
-        BuildError: the compiler refused, or this is Windows.
+        MissingDependencyError: there is no compiler, or no nanobind, whose headers Dr.Jit's headers include.
+        BuildError: the compiler failed, or this is Windows.
     """
     folder = mitsuba_folder()
     if folder.exists():
@@ -90,14 +92,14 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         for name in PLUGINS:
             plugin = into / "plugins" / f"{name}{_suffix()}"
             say(f"compiling {plugin.name}")
-            # Libraries come after what needs them.
+            # The flags come last: the linker looks for a file's symbols in the libraries named after it.
             _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", plugin], flags)
         shutil.copytree(_ADAPTERS, into / "adapters")
     return folder
 
 
 def library() -> Path:
-    """The C interface as a shared library, compiled unless it is there. Raises as `build_mitsuba`."""
+    """The shared library of the C interface, compiled unless that is done. Raises the errors of `build_mitsuba`."""
     folder, name = _cache() / f"library-{_digest()}", f"nma_c{_suffix()}"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", f"-I{sources()}"]
     if not folder.exists():
@@ -107,10 +109,10 @@ def library() -> Path:
 
 
 def compiler() -> str:
-    """The C++ compiler. Raises `MissingDependencyError`, on Windows `BuildError`."""
+    """The path of the C++ compiler. Raises `MissingDependencyError` if there is none, and `BuildError` on Windows."""
     if sys.platform == "win32":
         raise BuildError(
-            "Windows is not supported: the C++ runtime is compiled on Linux, and untested on macOS; take WSL, or the "
+            "Windows is not supported: the C++ runtime is compiled on Linux, and untested on macOS; use WSL, or the "
             "variants llvm_ad_rgb and cuda_ad_rgb, which need no compiler"
         )
     for name in filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")):
@@ -122,12 +124,12 @@ def compiler() -> str:
 
 
 def _suffix() -> str:
-    """Of a library, as Mitsuba looks for its plugins."""
+    """The file extension of a shared library, which is also that of Mitsuba's plugins."""
     return ".dylib" if sys.platform == "darwin" else ".so"
 
 
 def _leave_undefined() -> str:
-    """What tells the linker that Mitsuba's libraries bring along symbols of their own."""
+    """The linker flag that allows undefined symbols in Mitsuba's libraries, which are resolved when a plugin loads."""
     return "-Wl,-undefined,dynamic_lookup" if sys.platform == "darwin" else "-Wl,--allow-shlib-undefined"
 
 
@@ -156,7 +158,7 @@ def _cache() -> Path:
 
 @cache
 def _digest(*packages: str) -> str:
-    """Of the sources, the shipped adapters, and the versions of these packages."""
+    """A digest of the C++ sources; with `packages`, also of the shipped adapters and of the packages' versions."""
     digest = hashlib.sha256()
     folders = (sources(), _ADAPTERS) if packages else (sources(),)
     for file in sorted(f for folder in folders for f in folder.rglob("*") if f.is_file()):

@@ -1,12 +1,13 @@
-"""The C++ runtime from Python, for many queries at once: a compiled library, made when it is first wanted.
+"""The C++ runtime from Python, for many queries at once. Its shared library is compiled when it is first used.
 
     runtime = nma.native.runtime.Runtime("layered3-5x64")
     brdfs = runtime.prepare(params, wi)                        # (n, 13) in the training range, (n, 3)
     value, pdf = runtime.eval_pdf(brdfs, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
     wo, value, pdf = runtime.sample(brdfs, wi, u)
 
-Directions are unit vectors (n, 3) in the local frame, z up, `wi` towards the viewer, of the cosine that the BRDF was
-prepared for; of anisotropic adapters, of the same direction. All arrays become float32.
+Directions are unit vectors (n, 3) in the local frame, with z up; `wi` points towards the viewer. Call `eval_pdf` and
+`sample` with the `wi` of `prepare`. For isotropic adapters a `wi` with the same cosine is enough. All arrays are
+converted to float32.
 """
 
 from __future__ import annotations
@@ -26,41 +27,41 @@ from nma.native import build
 from nma.params import Bounds
 
 Array = NDArray[np.float32]
-# As nma_c.h numbers them.
+# The position of a name is its number in nma_c.h.
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
-# Bytes: the boundary that a BRDF lies on.
+# Alignment of a BRDF in memory [bytes].
 _ALIGNMENT = 16
 _MESSAGE = 500
 
 
 def available() -> tuple[str, ...]:
-    """The instruction sets of this CPU."""
+    """The names of the instruction sets that this CPU has."""
     return tuple(name for k, name in enumerate(INSTRUCTION_SETS[1:], 1) if _library().nma_supported(k))
 
 
 class Runtime:
-    """A loaded adapter.
+    """An adapter, loaded into the C++ runtime.
 
     Args:
-        adapter: a shipped adapter's name, or a weights file.
-        instruction_set: one of `INSTRUCTION_SETS`; one that the CPU lacks becomes "portable". All but "avx512_bf16"
-            compute in float32.
-        compact: round weights to bfloat16, which is faster; `runtime/README.md` says what it costs.
+        adapter: the name of a shipped adapter, or a weights file.
+        instruction_set: one of `INSTRUCTION_SETS`. A set that the CPU does not have is replaced by "portable". All sets
+            except "avx512_bf16" compute in float32.
+        compact: round the weights to bfloat16. This is faster, and `runtime/README.md` gives the loss of accuracy.
 
     Attributes:
-        parameters: numbers of a material that it takes, the columns of `params`.
-        names: the parameter that each column belongs to.
+        parameters: the number of columns of `params`.
+        names: for each column, the name of its parameter.
         low, high: the training range of each column.
-        material: the parameters of the only material that it knows, whatever their ranges; None of a class.
-        size: numbers that the network returns.
-        instruction_set: the one in use.
-        anisotropic: whether the view's azimuth matters.
+        material: the parameters of the material, if the adapter was trained on a single one; None otherwise.
+        size: the number of the network's outputs.
+        instruction_set: the instruction set in use.
+        anisotropic: whether the adapter depends on the azimuth of `wi`.
 
     Raises:
-        WeightsError: a file that is missing or damaged.
-        ParamError: an unknown instruction set.
-        MissingDependencyError, BuildError: the library cannot be compiled here.
+        WeightsError: the file is missing or damaged.
+        ParamError: the instruction set is unknown.
+        MissingDependencyError, BuildError: the shared library cannot be compiled on this machine.
     """
 
     def __init__(self, adapter: str | Path, instruction_set: str = "fastest", *, compact: bool = False):
@@ -75,7 +76,7 @@ class Runtime:
         if not handle:
             raise WeightsError(message.value.decode())
         self._handle = ctypes.c_void_p(handle)
-        # Floats of an opaque row.
+        # The number of floats in a row that `prepare` returns.
         self._brdf = self._library.nma_brdf_size() // np.dtype(np.float32).itemsize
         self.parameters = self._library.nma_parameter_count(self._handle)
         self.names = [self._name(k) for k in range(self.parameters)]
@@ -90,52 +91,58 @@ class Runtime:
             self._library.nma_free(handle)
 
     def outputs(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
-        """What the network returns, before decoding: (n, size). Arguments and errors are those of `prepare`."""
+        """The raw outputs (n, size) of the network. Arguments and errors are those of `prepare`."""
         return self._many("nma_outputs", self._checked(params, clamp), wi, self.size)
 
     def prepare(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
-        """BRDFs for `eval_pdf` and `sample`, opaque rows.
+        """Runs the network and returns n BRDFs for `eval_pdf` and `sample`, as an array of opaque rows.
 
         Args:
-            params: (n, parameters), within the training range.
-            wi: directions (n, 3), unit vectors above the horizon; or, for isotropic adapters, which look at nothing
-                else, their cosines (n,) in 0..1.
-            clamp: move parameters beyond the training range to it.
+            params: materials (n, parameters), within the training range.
+            wi: view directions (n, 3), unit vectors above the horizon. For isotropic adapters their cosines (n,), in
+                0..1, are enough.
+            clamp: clamp parameters to the training range instead of raising an error.
 
         Raises:
-            ParamError: parameters beyond the training range, or not finite; other shapes, different lengths, or cosines
-                for an anisotropic adapter.
+            ParamError: a parameter is outside the training range or not finite, an array has the wrong shape or length,
+                or an anisotropic adapter got cosines.
         """
         return self._many("nma_prepare", self._checked(params, clamp), wi, self._brdf)
 
     def eval(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """f cos(theta_o) [1/sr] (n, 3), 0 below the horizon."""
+        """f cos(theta_o) [1/sr], (n, 3). It is 0 below the horizon."""
         return self.eval_pdf(brdfs, wi, wo)[0]
 
     def pdf(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """The density of `sample` [1/sr] (n,), 0 below the horizon."""
+        """The density [1/sr] with which `sample` draws `wo`, (n,). It is 0 below the horizon."""
         return self.eval_pdf(brdfs, wi, wo)[1]
 
     def eval_pdf(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
-        """`eval` (n, 3) and `pdf` (n,) at the price of one."""
+        """The results of `eval` (n, 3) and `pdf` (n,), in the time of one of them."""
         found = self._each("nma_eval_pdf", brdfs, wi, 4, wo)
         return found[:, :3], found[:, 3]
 
     def sample(self, brdfs: Array, wi: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
-        """Directions (n, 3) drawn with uniform numbers (n, 3) in [0, 1), and `eval_pdf` of them; a density of 0 marks
-        an invalid one."""
+        """Draws directions `wo` from uniform numbers `u` (n, 3) in [0, 1).
+
+        Returns (wo (n, 3), value (n, 3), pdf (n,)), with value and pdf as `eval_pdf` gives them. A pdf of 0 marks an
+        invalid sample.
+        """
         found = self._each("nma_sample", brdfs, wi, 7, u)
         return found[:, :3], found[:, 3:6], found[:, 6]
 
     def albedo(self, brdfs: Array, wi: ArrayLike) -> Array:
-        """Directional albedos (n, 3) at `wi`, at most 1: the means over 128 fixed samples each, so without noise."""
+        """Directional albedos (n, 3) at `wi`, at most 1.
+
+        Each is the mean over 128 fixed samples, so equal arguments give equal albedos.
+        """
         return self._each("nma_albedo", brdfs, wi, 3)
 
     def _name(self, column: int) -> str:
         return self._library.nma_parameter_name(self._handle, column).decode()
 
     def _ranges(self) -> tuple[Array, Array]:
-        """Lower and upper ends of all columns."""
+        """The lower and the upper end of each column's training range, each (parameters,)."""
         ends = np.empty((self.parameters, 2), np.float32)
         for column, pair in enumerate(ends):
             self._library.nma_parameter_range(self._handle, column, _pointer(pair))
@@ -146,7 +153,7 @@ class Runtime:
         return numbers if self._library.nma_single_material(self._handle, _pointer(numbers)) else None
 
     def _checked(self, params: ArrayLike, clamp: bool) -> Array:
-        """Rows of parameters within the training range, or of the only material known."""
+        """`params` as float32 rows. Raises `ParamError` if they are outside the range, or not the single material's."""
         rows = _rows("params", params, self.parameters)
         if self.material is not None:
             other = ~np.isclose(rows, self.material, rtol=SAME)
@@ -154,7 +161,8 @@ class Runtime:
                 row, column = np.argwhere(other)[0]
                 raise ParamError(
                     f"{self.names[column]} of row {row} is {rows[row, column]:g}, but the adapter knows a single "
-                    f"material, whose own is {self.material[column]:g}; fit one to that material"
+                    f"material, whose {self.names[column]} is {self.material[column]:g}; "
+                    "fit another adapter to the new material"
                 )
             return rows
         allowed = Bounds(self.low, self.high)
@@ -176,13 +184,13 @@ class Runtime:
         return found
 
     def _views(self, wi: ArrayLike) -> Array:
-        """Directions (n, 3), or cosines (n,) where they are enough."""
+        """`wi` as float32: directions (n, 3), or cosines (n,) if the adapter is isotropic."""
         shape = np.shape(wi)
         if len(shape) > 1:
             return _rows("wi", wi, 3)
         if self.anisotropic:
             raise ParamError(
-                f"an anisotropic adapter wants whole directions: give wi of shape (n, 3), not cosines {shape}"
+                f"an anisotropic adapter needs directions: give wi of shape (n, 3), not cosines {shape}"
             )
         return _rows("wi", wi)
 
@@ -197,11 +205,11 @@ class Runtime:
 
 
 def _rows(name: str, values: ArrayLike, *row: int) -> Array:
-    """Contiguous float32: rows of this shape."""
+    """`values` as a contiguous, aligned float32 array (n, *row). Raises `ParamError` for another shape."""
     array = np.ascontiguousarray(values, np.float32)
     if array.shape[1:] != row:
         wanted = "(n,)" if not row else f"(n, {row[0]})"
-        raise ParamError(f"{name} wants shape {wanted}, got {array.shape}")
+        raise ParamError(f"{name} must have shape {wanted}, got {array.shape}")
     return array if array.ctypes.data % _ALIGNMENT == 0 else array.copy()
 
 
