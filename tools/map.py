@@ -236,12 +236,12 @@ def _number(number: int, x: int, y: int) -> str:
 def _legend(p: Plan) -> list[str]:
     """What the arrows mean, and the steps of the data."""
     left, top = MARGIN + 12, _top(len(p.floors)) + 4
-    told = "A room imports what its thin arrows point to; where a longer way leads there, too, the arrow is left out."
+    told = "The upper room imports the lower one. No arrow is drawn where a longer way leads to the same room."
     parts = [
         f'<path class="import" d="M{left} {top - 4}h34"/>',
         f'<text class="legend" x="{left + 46}" y="{top}">{told}</text>',
         f'<path class="way" d="M{left} {top + 18}h30"/>',
-        f'<text class="legend" x="{left + 46}" y="{top + 22}">The way of the data:</text>',
+        f'<text class="legend" x="{left + 46}" y="{top + 22}">The data goes this way:</text>',
     ]
     for n, step in enumerate(WAY, start=1):
         y = top + 22 * (n + 1)
