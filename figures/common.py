@@ -20,13 +20,17 @@ from numpy.typing import NDArray
 import nma
 from nma import files
 from nma.evaluate.metrics import table_metrics
+from nma.params import Population
 
 ROOT = Path(__file__).parent.parent
 REFERENCES = ROOT / "out/references"
 # Measured materials, which are no part of this repository.
 DATA = Path(os.environ.get("NMA_TEST_DATA") or ROOT.parent / "shared/data")
 # The sets of unseen materials: (materials, population, seed).
-SETS = {"range": (89, "range", 89), "metals": (60, "unseen_metals", 60)}
+SETS: dict[str, tuple[int, Population, int]] = {
+    "range": (89, "range", 89),
+    "metals": (60, "unseen_metals", 60),
+}
 REFERENCE_WALKS = 64_000_000
 
 

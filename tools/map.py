@@ -236,7 +236,9 @@ def _number(number: int, x: int, y: int) -> str:
 def _legend(p: Plan) -> list[str]:
     """What the arrows mean, and the steps of the data."""
     left, top = MARGIN + 12, _top(len(p.floors)) + 4
-    told = "The upper room imports the lower one. No arrow is drawn where a longer way leads to the same room."
+    told = (
+        "The upper room imports the lower one. No arrow is drawn where a longer way leads to the same room."
+    )
     parts = [
         f'<path class="import" d="M{left} {top - 4}h34"/>',
         f'<text class="legend" x="{left + 46}" y="{top}">{told}</text>',

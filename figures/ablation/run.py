@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,7 +26,7 @@ from nma.train.recipe import preset
 from nma.train.run import train_class
 
 # What changes, by name. The paper's recipe sees as many bins in total, at its own learning rate and at higher ones.
-CHANGES = {
+CHANGES: dict[str, dict[str, Any]] = {
     "class": {},
     "no albedo": {"albedo": 0.0},
     "not bounded": {"bounded": False},

@@ -99,7 +99,8 @@ def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict
     settings, tables = data(arguments.data, quick)
     how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
     # The validation set decides nothing about the decoder.
-    stem, record = f"{how.network}_{settings.materials}_{how.steps}-steps", {"dataset": asdict(settings)}
+    stem = f"{how.network}_{settings.materials}_{how.steps}-steps"
+    record: dict[str, Any] = {"dataset": asdict(settings)}
     with console.TrainingBar(how, "decoder") as bar:
         whole, run = direct.train(tables, how, record, kept / f"{stem}.ckpt", bar.update)
     again = direct.recipe(arguments.latent_steps, how.network)
@@ -107,7 +108,10 @@ def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict
     path = kept / f"{stem}_{again.steps}-latent-steps.ckpt"
     with console.TrainingBar(again, "latents") as bar:
         fitted, fit = direct.train(reference, again, record, path, bar.update, whole.decoder)
-    took = {"bins_seen": how.steps * how.bins_per_step, "training_seconds": round(run.seconds)}
+    took: dict[str, Any] = {
+        "bins_seen": how.steps * how.bins_per_step,
+        "training_seconds": round(run.seconds),
+    }
     return fitted, took | {"latent_seconds_per_material": round(fit.seconds / len(reference.params), 2)}
 
 
@@ -155,11 +159,12 @@ def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any,
 
 def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, Any]:
     """Figures of every material with their means, and seconds for as many points as the paper has."""
-    bins = np.stack(np.unravel_index(np.arange(ISOTROPIC.bins), ISOTROPIC.shape[:3])).astype(np.float32)
+    i, o, p = np.stack(np.unravel_index(np.arange(ISOTROPIC.bins), ISOTROPIC.shape[:3])).astype(np.float32)
+    assert reference.error is not None
     materials, seconds = [], []
     for number, table in enumerate(reference.values):
         u = np.random.default_rng((0x7AB1E5, number)).random((3, per_bin, ISOTROPIC.bins), np.float32)
-        points = quadrature.uniform_bin_points(*bins, tuple(u))
+        points = quadrature.uniform_bin_points(i, o, p, (u[0], u[1], u[2]))
         wi = Vec3(*(np.broadcast_to(x, points.wo.z.shape) for x in points.wi))
         began = time.perf_counter()
         value = evaluate(number, wi, points.wo)
@@ -205,7 +210,7 @@ def markdown(results: dict[str, Any]) -> str:
 
 def plot(results: dict[str, Any], path: Path) -> None:
     """Fig. 11: absolute error and log loss of every material, in the order of the first adapter's."""
-    curves = {}
+    curves: dict[str, tuple[list, dict[str, Any]]] = {}
     for name, result in results.items():
         if "exact" in result:
             curves[f"{name}, {POINTS} points per bin"] = (result["materials"], {"linewidth": 0.5})

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -95,7 +96,7 @@ def _albedos(
         return k + 1, *(s + w for s, w in zip(sums, weights, strict=True))
 
     # In single precision a million terms would be rounded the same way.
-    start = (dr.zeros(UInt32, len(mu)), *(dr.zeros(Sum, len(mu)) for _ in range(3)))
+    start: Any = (dr.zeros(UInt32, len(mu)), *(dr.zeros(Sum, len(mu)) for _ in range(3)))
     sums = dr.while_loop(start, lambda k, *_: k < samples, body, mode="symbolic", label="albedo")[1:]
     return np.max([s.numpy() for s in sums], axis=0) / samples
 

@@ -101,7 +101,7 @@ def textured(adapter: str) -> dict[str, Any]:
 
 def render(bsdf: dict[str, Any], size: int, spp: int, way: Way, seed: int = 0) -> Image:
     """A picture of the ball."""
-    options = {"size": (size, size), "lighting": way.lighting, "sampler": way.sampler}
+    options: dict[str, Any] = {"size": (size, size), "lighting": way.lighting, "sampler": way.sampler}
     scene = load_dict(nma.preview_scene(bsdf, **options))
     integrator = clamped(scene.integrator(), way.clamp) if way.clamp else None
     return render_passes(scene, spp, seed=seed, integrator=integrator)

@@ -14,6 +14,7 @@ import json
 from argparse import Namespace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,7 +26,7 @@ from nma.train.run import fit_material
 
 SET = "range"
 # Targets that are fitted; the first one is the class adapters'.
-TARGETS = {
+TARGETS: dict[str, dict[str, Any]] = {
     "fit, two instances": {"target": "principled"},
     "fit, two stretched": {"target": "stretched"},
     "fit, four stretched": {"target": "stretched", "instances": 4},
@@ -92,7 +93,7 @@ def plot(rows: list[dict], path: Path) -> None:
     axes = figure.add_subplot(ylabel="log loss (eq. 7)", xlabel="materials, by the class adapter's log loss")
     for name in (name for name in rows[0] if name != "params"):
         losses = [row[name]["log_loss"] for row in rows]
-        style = {"color": "gray", "linestyle": ":"} if name == "noise" else {"marker": "o"}
+        style: dict[str, Any] = {"color": "gray", "linestyle": ":"} if name == "noise" else {"marker": "o"}
         axes.plot(losses, label=f"{name}: {np.mean(losses):.4f}", **style)
     axes.set_ylim(bottom=0)
     axes.set_xticks(range(len(rows)))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -61,7 +61,8 @@ def fit(name: str, quick: bool) -> Fit:
     walks = 4_000_000 if quick else common.REFERENCE_WALKS
     seen = nma.tabulate(source, vector[None], walks, stream_keys(0, [0]), error=False)
     reference = nma.tabulate(source, vector[None], walks, stream_keys(999, [0]))
-    tables, figures = {}, {}
+    tables: dict[str, NDArray] = {}
+    figures: dict[str, Any] = {}
     for label, changes in VARIANTS.items():
         began = time.perf_counter()
         recipe = preset("single", **changes, steps=150 if quick else None)
@@ -114,7 +115,8 @@ def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
     theta, reference = in_plane(fit.reference, angle)
     across, up = np.sin(theta)[:, None], np.cos(theta)[:, None]
     ours = in_plane(fit.tables[label], angle)[1]
-    for values, style in (reference, {"alpha": 0.3, "linewidth": 4.5}), (ours, {"linewidth": 1.2}):
+    styles: list[dict[str, Any]] = [{"alpha": 0.3, "linewidth": 4.5}, {"linewidth": 1.2}]
+    for values, style in zip((reference, ours), styles, strict=True):
         for x, y, colour in zip((across * np.sqrt(values)).T, (up * np.sqrt(values)).T, COLOURS, strict=True):
             ax.plot(x, y, color=colour, **style)
     # A sharp coat's peak, a few bins wide and far above the rest, would hide all else: it leaves the frame.

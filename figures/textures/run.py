@@ -120,7 +120,7 @@ def plot(steps: dict[str, Step], adapter: str, size: Size, path: Path) -> None:
         Row(f"Adapter: nma, {Path(adapter).stem}, {size.spp} spp", [s.adapter for s in made]),
         Row(f"FLIP, black 0 to yellow {FLIP_SCALE:g}", differences),
     ]
-    table = [("of noise alone in brackets", *TABLED)]
+    table: list[tuple[str, ...]] = [("of noise alone in brackets", *TABLED)]
     for label, step in steps.items():
         table.append((label, *(f"{step.metrics[m]:.4f} ({step.noise[m]:.4f})" for m in TABLED)))
     contact_sheet(path, rows, list(steps), table=table)
