@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from adapter_cases import random_adapter
 from material_cases import write_image
+from runtime_cases import pointer
 
 import nma.render
 from nma import materials
@@ -203,3 +204,12 @@ def test_the_derivative_on_a_bound_is_1_so_that_values_come_back():
     dr.enable_grad(x)
     dr.backward(Bounds(0.0, 1.0).moved(x))
     np.testing.assert_array_equal(x.grad.numpy(), [0, 1, 1, 1, 0])
+
+
+def test_cpp_allows_the_same_numbers(adapter):
+    runtime = Runtime(adapter)
+    for steps, known in ((0.5, True), (3, False)):
+        for name, value in beyond("training", steps):
+            row = LAYERED3.vector(PLAIN | {name: value}).astype(np.float32)
+            found = runtime._library.nma_check(runtime._handle, pointer(row))
+            assert (found == -1) == known, (name, value)

@@ -64,12 +64,12 @@ def test_edits_are_rendered_at_once_or_refused(kind):
     params.update()
     np.testing.assert_allclose(look(bsdf), look(mi.load_dict(material | {"albedo": 0.5})), rtol=0.02)
     params["albedo.data"] = mi.TensorXf(np.where(image == image[1, 2], 3.0, image))
-    assert "the texture of albedo holds 3 at x=2, y=1" in refusal(params.update)
-    assert "the texture of albedo holds 3" in refusal(lambda: look(bsdf))
+    assert "the texture of albedo at x=2, y=1: albedo is 3" in refusal(params.update)
+    assert "the texture of albedo at x=2, y=1: albedo is 3" in refusal(lambda: look(bsdf))
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
                           "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
                           "ball": {"type": "sphere", "center": [0, 0, 3], "bsdf": bsdf}})
-    assert "the texture of albedo holds 3" in refusal(lambda: mi.render(scene, spp=1))
+    assert "the texture of albedo at x=2, y=1: albedo is 3" in refusal(lambda: mi.render(scene, spp=1))
     params["albedo.data"] = mi.TensorXf(image)
     params.update()
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
@@ -105,7 +105,7 @@ def test_edits_of_shared_textures_are_seen(kind):
             params.update()
         except RuntimeError:
             pass
-        assert "the texture of albedo holds 3, allowed is 0 .. 1" in refusal(lambda: look(bsdf))
+        assert "the texture of albedo: albedo is 3, allowed is 0 .. 1" in refusal(lambda: look(bsdf))
         """,
         "scalar_rgb",
         kind,
@@ -230,39 +230,45 @@ def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
         ({"material": "wet-nickel"}, "`material` is known in vectorised variants only"),
         (
             {"sigma_t": bitmap(7.0)},
-            "sigma_t holds 7 at x=1, y=2, one of 3 such values of 36; allowed is 0 .. 1",
+            "the texture of sigma_t at x=1, y=2: sigma_t is 7, allowed is 0 .. 1, the range",
         ),
-        ({"sigma_t": bitmap(math.nan), "clamp": True}, "the texture of sigma_t holds nan at x=1, y=2"),
+        ({"sigma_t": bitmap(math.nan), "clamp": True}, "the texture of sigma_t at x=1, y=2: sigma_t is nan"),
         ({"sigma_t": coloured}, "the texture of sigma_t is coloured, and sigma_t is one number per pixel"),
         ({"sigma_t": coloured}, "choose a channel: set `sigma_t_channel` to r, g or b"),
         ({"sigma_t": coloured, "sigma_t_channel": "g"}, None),
         ({"sigma_t": bitmap([7, 0.5, 0]), "sigma_t_channel": "g"}, None),
         (
             {"sigma_t": bitmap([0, 7, 0]), "sigma_t_channel": "g"},
-            "holds 7 at x=1, y=2, one of 1 such values of 12",
+            "at x=1, y=2: sigma_t is 7, allowed",
         ),
         ({"sigma_t": coloured, "sigma_t_channel": "a"}, "sigma_t_channel is 'a'; take r, g or b"),
         ({"sigma_t_channel": "g"}, "sigma_t_channel chooses a channel of a texture"),
         ({"albedo_channel": "g"}, "albedo_channel chooses a channel of a texture"),
-        ({"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo holds 1.5, one of 1"),
+        ({"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo: albedo is 1.5, allowed"),
         ({"sigma_t": COLOUR}, "sigma_t wants one number or a texture, got the colour 0.1, 0.5, 0.9"),
         ({"sigma_t": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}, None),
         ({"albedo": [0.1, 0.5, 0.9]}, None),
-        ({"albedo": [0.1, 1.5, 0.9]}, "albedo is 1.5, allowed is 0 .. 1"),
+        ({"albedo": [0.1, 1.5, 0.9]}, "albedo is 0.1, 1.5, 0.9, allowed is 0 .. 1"),
         ({"sigma_t": shared}, "the texture of sigma_t is coloured"),
         ({"sigma_t": shared, "sigma_t_channel": "b"}, None),
         ({"sigma_t": bitmap(7.0), "clamp": True}, None),
         (
             {"sigma_t": bitmap(-1.0), "type": "layered"},
-            "the texture of sigma_t holds -1 at x=1, y=2, one of 3",
+            "the texture of sigma_t at x=1, y=2: sigma_t is -1, allowed is 0 .. 1000; take a value",
         ),
         ({"sigma_t": bitmap(7.0), "type": "layered"}, None),
         ({"adapter": one, "sigma_t": 0.5}, None),
         ({"adapter": one, **dict.fromkeys(MATERIAL)}, None),
         ({"adapter": one, "sigma_t": 0.6}, "knows a single material, whose sigma_t is 0.5, not 0.6"),
         ({"adapter": one, "sigma_t": bitmap(0.5)}, "so that no texture can drive sigma_t"),
-        ({"eta_top": png(tmp_path, False)}, "the texture of eta_top holds 0.21586 at x=0, y=0"),
-        ({"eta_top": png(tmp_path, True)}, "the texture of eta_top holds 0.501961"),
+        (
+            {"eta_top": png(tmp_path, False)},
+            "the texture of eta_top at x=0, y=0, the first of 4 such pixels: eta_top is 0.21586",
+        ),
+        (
+            {"eta_top": png(tmp_path, True)},
+            "the texture of eta_top at x=0, y=0, the first of 4 such pixels: eta_top is 0.5019608",
+        ),
         (
             {"eta_top": png(tmp_path, True)},
             'its pixels are bytes, 0 to 1; with `format` "variant" a bitmap keeps',

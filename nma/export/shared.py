@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nma import sources
+from nma import params, sources
 from nma.adapter import adapter, encoding, weights
 from nma.params import SPACES, ParamSpace
 from nma.sources import layered, layered_eval
@@ -19,6 +19,7 @@ _GENERAL = (
     (principled, ("DIALECT",)),
     (weights, ("FORMAT", "MAX_DEPTH")),
     (adapter, ("SAME",)),
+    (params, ("ROUNDING",)),
     (encoding, ("GRAZING", "MIN_COS_T")),
 )
 _LAYERED = (

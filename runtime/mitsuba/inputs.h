@@ -127,7 +127,7 @@ public:
         const Colour colour = input.looked_up(si);
         for (int c = 0; input.known && c < input.param.size; ++c)
             if (!allowed(input.param, colour[c]))
-                Throw("the texture of %s holds %g, %s", input.param.name, colour[c], range(input.param));
+                Throw("the texture of %s: %s", input.param.name, refusal(input.param, colour));
         return within(input.param, colour);
     }
 
@@ -196,7 +196,7 @@ private:
             return;
         }
         for (int c = 0; c < p.size; ++c)
-            if (!allowed(p, input.shown[c])) Throw("%s is %g, %s", p.name, input.shown[c], range(p));
+            if (!allowed(p, input.shown[c])) Throw("%s", refusal(p, input.shown));
         input.value = within(p, input.shown);
     }
 
@@ -211,22 +211,25 @@ private:
                     "the texture of %s is coloured, and %s is one number per pixel; choose a channel: set `%s_channel` "
                     "to r, g or b",
                     p.name, p.name, p.name);
-        std::size_t first = numbers.size(), bad = 0;
+        std::size_t first = numbers.size(), last = numbers.size(), bad = 0;
         const std::size_t start = one ? static_cast<std::size_t>(input.channel) : 0, step = one ? texels.channels : 1;
         for (std::size_t k = start; k < numbers.size(); k += step)
-            if (!allowed(p, numbers[k])) {
+            if (!allowed(p, numbers[k]) && k / texels.channels != last) {
+                last = k / texels.channels;
                 if (bad++ == 0) first = k;
             }
         if (!bad) return;
         const std::size_t pixel = first / texels.channels;
-        const std::string place =
+        const auto* at = &numbers[pixel * texels.channels];
+        const Colour found = coloured && p.size == 3 ? Colour(at[0], at[1], at[2]) : Colour(numbers[first]);
+        std::string place =
             texels.pixels() > 1 ? tfm::format(" at x=%zu, y=%zu", pixel % texels.width, pixel / texels.width) : "";
+        if (bad > 1) place += tfm::format(", the first of %zu such pixels", bad);
         const char* hint =
             texels.bytes
                 ? "; its pixels are bytes, 0 to 1; with `format` \"variant\" a bitmap keeps floats, which can be edited"
                 : "";
-        Throw("the texture of %s holds %g%s, one of %zu such values of %zu; %s%s", p.name, numbers[first], place, bad,
-              numbers.size() / step, range(p), hint);
+        Throw("the texture of %s%s: %s%s", p.name, place, refusal(p, found), hint);
     }
 
     bool allowed(const SourceParam& p, Float x) const {
@@ -234,9 +237,15 @@ private:
         return nma::is_finite(number) && (clamp_ || p.allows(number));
     }
 
-    std::string range(const SourceParam& p) const {
-        const char* hint = trained_ ? ", the range that the adapter was trained on; set `clamp` to move it there" : "";
-        return tfm::format("allowed is %g .. %g%s", p.low, p.high, hint);
+    // What to say of a value that is not allowed: the sentence of `Bounds.refusal` in nma/params.py.
+    std::string refusal(const SourceParam& p, const Colour& found) const {
+        const auto text = [](Float x) { return tfm::format("%.7g", x); };
+        const std::string x = text(found.x()), y = text(found.y()), z = text(found.z());
+        const bool grey = p.size == 1 || (x == y && x == z);
+        const char* advice = trained_ ? ", the range that the adapter was trained on; set `clamp` to move it there"
+                                      : "; take a value in between";
+        return tfm::format("%s is %s, allowed is %g .. %g%s", p.name, grey ? x : x + ", " + y + ", " + z, p.low, p.high,
+                           advice);
     }
 
     std::vector<Input> inputs_;

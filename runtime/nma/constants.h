@@ -10,6 +10,8 @@ constexpr int FORMAT = 1;
 constexpr int MAX_DEPTH = 32;
 // From nma/adapter/adapter.py
 constexpr float SAME = 1e-05f;
+// From nma/params.py
+constexpr float ROUNDING = 1e-06f;
 // From nma/adapter/encoding.py
 constexpr float GRAZING = 0.1045f;
 constexpr float MIN_COS_T = 0.05f;

@@ -39,7 +39,7 @@ struct SourceParam {
 
     // Whether x is finite and within the range, but for a rounding error.
     bool allows(float x) const {
-        const double slack = 1e-6 * maximum(absolute(low), 1.0);
+        const double slack = ROUNDING * minimum(high - low, 1.0);
         return is_finite(x) && x >= low - slack && x <= high + slack;
     }
     // The nearest number of the range; the lower end for NaN.
