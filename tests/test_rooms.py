@@ -27,7 +27,7 @@ def test_rooms_and_floors_are_few_enough_to_remember():
 
 def test_the_committed_drawing_is_that_of_the_imports():
     assert OUT.read_text() == drawing(), (
-        "the rooms have changed: run `python -m tools.map`, and look at the drawing"
+        "the rooms, their imports or their docstrings have changed: run `python -m tools.map`, look at the drawing"
     )
 
 
