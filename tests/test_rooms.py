@@ -76,7 +76,7 @@ def test_circles_are_found():
     assert rooms.circle(way | {("params", "table")}) == ["cli", "params", "table"]
 
 
-def test_a_room_is_told_by_as_many_clauses_as_fit(tmp_path, monkeypatch):
+def test_a_room_is_told_by_the_longest_beginning_that_fits(tmp_path, monkeypatch):
     monkeypatch.setattr(rooms, "ROOT", tmp_path)
     (tmp_path / rooms.PACKAGE).mkdir()
     (tmp_path / rooms.PACKAGE / "attic.py").write_text(
@@ -84,7 +84,13 @@ def test_a_room_is_told_by_as_many_clauses_as_fit(tmp_path, monkeypatch):
     )
     assert rooms.summary("attic") == "Old things: chairs, tables (some broken)"
     assert rooms.summary("attic", lambda text: len(text) < 30) == "Old things: chairs, tables"
-    assert rooms.summary("attic", lambda text: False) == "Old things"
+    assert rooms.summary("attic", lambda text: len(text) < 20) == "Old things"
+    with pytest.raises(ValueError, match="attic.py: no beginning of the first sentence fits"):
+        rooms.summary("attic", lambda text: False)
+    (tmp_path / rooms.PACKAGE / "attic.py").write_text(
+        '"""Things that are old, and things that are broken."""'
+    )
+    assert rooms.summary("attic", lambda text: len(text) < 30) == "Things that are old"
 
 
 def test_the_page_names_registries_that_are_there():

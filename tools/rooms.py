@@ -74,10 +74,16 @@ def circle(arrows: frozenset[Arrow]) -> list[str]:
 
 
 def summary(room: str, fits: Callable[[str], bool] = lambda text: True) -> str:
-    """What a room is: as many clauses of its docstring's first sentence as fit, at least one."""
+    """What a room is: the longest beginning of its docstring's first sentence that fits.
+
+    It ends at a colon, a semicolon or a parenthesis. If none of these beginnings fits, it ends at a comma.
+    """
     place = ROOT / PACKAGE / room
     file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
     text = " ".join((ast.get_docstring(ast.parse(file.read_text())) or "").split())
     sentence = re.split(r"[.:]?$|\.\s", text, maxsplit=1)[0]
-    clauses = list(itertools.accumulate(re.split(r"(?=[:;]\s|\s\()", sentence)))
-    return max([clauses[0], *filter(fits, clauses)], key=len)
+    for ends in (r"(?=[:;]\s|\s\()", r"(?=,\s)"):
+        beginnings = list(itertools.accumulate(re.split(ends, sentence)))
+        if found := [beginning for beginning in beginnings if fits(beginning)]:
+            return found[-1]
+    raise ValueError(f"{file}: no beginning of the first sentence fits; write a shorter one")
