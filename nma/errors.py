@@ -2,6 +2,7 @@
 
 import re
 import textwrap
+from collections.abc import Iterable
 
 _TRACEBACK = "Traceback (most recent call last):"
 _LONGEST = 600  # most characters of a message: some of Mitsuba's errors print whole objects
@@ -45,6 +46,12 @@ class OutputError(NmaError, OSError):
 
 class MissingDependencyError(NmaError, ImportError):
     """A package or a program that a feature needs is missing or too old."""
+
+
+def either(words: Iterable[str]) -> str:
+    """What may be chosen: a, b or c."""
+    *others, last = words
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def one_line(message: str) -> str:

@@ -46,7 +46,7 @@ def test_the_chosen_channel_is_the_number(kind, packed):
             "coloured.*alpha_bottom is one number per pixel; choose a channel: set `alpha_bottom_channel`",
         ),
         ("b", r"at x=0, y=0, the first of 16 such pixels: \w+ is 0, allowed.*bytes.*`format` \"variant\""),
-        ("luminance", "alpha_bottom_channel is 'luminance'; take r, g, b"),
+        ("luminance", "alpha_bottom_channel is 'luminance'; take r, g or b"),
     ),
 )
 def test_other_choices_are_refused(kind, packed, channel, message):

@@ -14,6 +14,10 @@ from nma.errors import NmaError, one_line
 from nma.files import whole, write_bytes
 from nma.images.size import MOST_PIXELS, header_size
 
+# The channels of an image in the order of a pixel's numbers, and those that are its colour.
+CHANNELS = ("r", "g", "b", "a")
+COLOUR = CHANNELS[:3]
+
 
 class ImageError(NmaError, ValueError):
     """An image cannot be read or written, has the wrong shape, or holds values that are not finite."""
@@ -63,6 +67,12 @@ def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -
 def to_8bit(display: ArrayLike) -> NDArray[np.uint8]:
     """Display values in 0..1 to bytes, rounded."""
     return (np.clip(np.asarray(display, dtype=np.float32), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def linear(srgb: ArrayLike) -> NDArray[np.float64]:
+    """Display values in 0..1 to light: the inverse of the sRGB transfer curve (IEC 61966-2-1)."""
+    x = np.asarray(srgb, np.float64)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
 
 
 def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 0.8) -> Path:

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.data import load_conductors
-from nma.errors import MaterialError, ParamError, one_line
-from nma.materials.texture import CHANNELS, Texture
+from nma.errors import MaterialError, ParamError, either, one_line
+from nma.images.io import CHANNELS, linear
+from nma.materials.texture import Texture
 from nma.params import SPACES, Param, ParamSpace
 
 __all__ = ["Material", "Texture", "load", "names"]
@@ -207,15 +208,14 @@ def _value(given: Any, param: Param, path: Path, uv_scale: float) -> float | tup
 
 
 def _colour(given: str, param: Param, path: Path) -> tuple[float, ...]:
-    """A colour of sRGB in hexadecimal digits, made linear (IEC 61966-2-1)."""
+    """A colour of sRGB in hexadecimal digits, made linear."""
     if not _is_colour(param):
         raise MaterialError(
             f"{path}: {param.name} is no colour, so {_shown(given)} means nothing; give numbers"
         )
     if not re.fullmatch("#[0-9a-fA-F]{6}", given):
         raise MaterialError(f"{path}: {param.name} is {_shown(given)}; a colour has six digits, as '#3366ee'")
-    srgb = [int(given[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
-    return tuple(x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in srgb)
+    return tuple(linear([int(given[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]).tolist())
 
 
 def _is_colour(param: Param) -> bool:
@@ -246,8 +246,10 @@ def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
     channel = given.get("channel")
     if channel is None:
         return None
-    if not (isinstance(channel, str) and len(channel) == 1 and channel in CHANNELS):
-        raise MaterialError(f"{where}: channel is {_shown(channel)}, but must be 'r', 'g', 'b' or 'a'")
+    if channel not in CHANNELS:
+        raise MaterialError(
+            f"{where}: channel is {_shown(channel)}, but must be {either(map(repr, CHANNELS))}"
+        )
     if param.size > 1:
         raise MaterialError(f"{where}: a channel is for parameters of one number, this one has {param.size}")
     return channel

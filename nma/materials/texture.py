@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.errors import TextureError, one_line
-from nma.images.io import ImageError, coloured_layer, load_bitmap
+from nma.errors import TextureError, either, one_line
+from nma.images.io import CHANNELS, ImageError, coloured_layer, load_bitmap
 from nma.params import Param
 
-# The channels of an image, by which one of them is chosen for a parameter of one number.
-CHANNELS = "rgba"
 # What a grey pixel's channels may differ by, for pixels up to 1: rounding.
 _GREY = 1e-6
 
@@ -68,7 +66,7 @@ class Texture:
         if self.channel is None and _is_coloured(pixels):
             raise TextureError(
                 f"texture {self.path} is coloured, {self.parameter.name} is one number: "
-                f"choose a channel, {{ texture = '{self.path.name}', channel = 'g' }} ('r', 'g', 'b' or 'a')"
+                f"choose a channel, {{ texture = '{self.path.name}', channel = 'g' }} ({either(map(repr, CHANNELS))})"
             )
         first = CHANNELS.index(self.channel or "r")
         return pixels[..., first : first + 1]

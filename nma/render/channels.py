@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nma.images.io import CHANNELS
+
 # IEC 61966-2-1, as `mitsuba.xyz_to_srgb` has it.
 _XYZ_TO_SRGB = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]],
     np.float32,
 )
-_NESTED = ["R", "G", "B", "A"]
+_RGBA = [letter.upper() for letter in CHANNELS]
 
 
 def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
@@ -25,7 +27,7 @@ def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
     film = [channel.name for channel in scene.sensors()[sensor].film().bitmap().struct_()]
     own = film[: len(film) - len(announced)]
     nested = 0
-    while [name.rpartition(".")[2] for name in announced[4 * nested : 4 * nested + 4]] == _NESTED:
+    while [name.rpartition(".")[2] for name in announced[4 * nested : 4 * nested + 4]] == _RGBA:
         nested += 1
     others = [name.rpartition(".")[0] for name in announced[4 : 4 * nested : 4]]
     more = [f"{other}.{name}" for other in others for name in own] + announced[4 * nested :]
@@ -37,7 +39,7 @@ def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
 
 def colours(image: NDArray[np.float32], names: list[str]) -> NDArray[np.float32]:
     """The picture's colours as linear sRGB (height, width, 3): its first three channels if they are such, else grey."""
-    if names[:3] == ["R", "G", "B"]:
+    if names[:3] == _RGBA[:3]:
         return image[..., :3]
     if names[:3] == ["X", "Y", "Z"]:
         return image[..., :3] @ _XYZ_TO_SRGB.T

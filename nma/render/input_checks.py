@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.errors import ParamError, TextureError
+from nma.errors import ParamError, TextureError, either
+from nma.images.io import COLOUR, linear
 from nma.materials.texture import first_pixel
 from nma.params import Param, Range
-
-CHANNELS = ("r", "g", "b")
 
 
 class Allowed(NamedTuple):
@@ -71,9 +70,7 @@ def _decoded(pixels: NDArray, texture: Any) -> NDArray:
     if pixels.dtype != np.uint8:
         return pixels
     unit = pixels / 255.0
-    if "raw = 1" in str(texture):
-        return unit
-    return np.where(unit <= 0.04045, unit / 12.92, ((unit + 0.055) / 1.055) ** 2.4)
+    return unit if "raw = 1" in str(texture) else linear(unit)
 
 
 def _check_pixels(allowed: Allowed, pixels: NDArray, where: str, channel: int | None) -> None:
@@ -85,7 +82,7 @@ def _check_pixels(allowed: Allowed, pixels: NDArray, where: str, channel: int | 
     elif size == 1 and coloured and np.ptp(pixels, axis=-1).max() > 1e-6:
         raise TextureError(
             f"{where} is coloured, and {name} is one number per pixel; choose a channel: set `{name}_channel` to "
-            f"{', '.join(CHANNELS[:-1])} or {CHANNELS[-1]}"
+            f"{either(COLOUR)}"
         )
     bad = allowed.bad(pixels)
     if bad.any():

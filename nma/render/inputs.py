@@ -8,9 +8,10 @@ import numpy as np
 
 from nma import materials
 from nma.adapter import Adapter
-from nma.errors import ParamError, TextureError
+from nma.errors import ParamError, TextureError, either
+from nma.images.io import COLOUR
 from nma.params import MEASURED, Param, ParamSpace, Range
-from nma.render.input_checks import CHANNELS, Allowed, check_numbers, check_texture
+from nma.render.input_checks import Allowed, check_numbers, check_texture
 from nma.render.textures import bitmap_texture
 
 
@@ -280,9 +281,9 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
     wanted = props[name]
     if param.size > 1 or not isinstance(value, mi.Texture):
         raise ParamError(f"{name} chooses a channel of a texture for a parameter of one number; leave it out")
-    if wanted not in CHANNELS:
-        raise ParamError(f"{name} is {wanted!r}; take {', '.join(CHANNELS)}")
-    return CHANNELS.index(wanted)
+    if wanted not in COLOUR:
+        raise ParamError(f"{name} is {wanted!r}; take {either(COLOUR)}")
+    return COLOUR.index(wanted)
 
 
 def _setting(props: Any, name: str, default: Any) -> Any:
