@@ -1,4 +1,4 @@
-"""Adapters that were not trained, and materials for them, which several test files share."""
+"""Untrained adapters, and materials for them. Several test files share these."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def random_adapter(
     params=PRINCIPLED_PARAMS,
     space=LAYERED3,
 ):
-    """An adapter that was not trained, with outputs that vary over the class."""
+    """Returns an untrained adapter. Its random weights are large enough that its outputs vary over the class."""
     rng = np.random.default_rng(seed)
     sizes = [
         encoding.size(name, space, directional),
@@ -33,7 +33,7 @@ def random_adapter(
 
 
 def random_anisotropic_adapter(hidden="3x32", seed=0):
-    """Of a single material whose looks change with the view's azimuth."""
+    """Returns an untrained adapter of a single material whose appearance changes with the azimuth of the view."""
     about = {"name": "azimuth", "params": ANISOTROPIC_PARAMS, "space": MEASURED}
     return random_adapter(hidden=hidden, seed=seed, **about)
 

@@ -1,4 +1,4 @@
-"""The commands and their options as they are declared, for tests that loop over them."""
+"""Lists the declared commands and their options, for tests that loop over them."""
 
 from typing import get_args, get_type_hints
 
@@ -8,7 +8,7 @@ from nma import cli
 
 
 def commands(app=cli.app, path=()):
-    """Every command's words, (`library`, `encode`) for example, and its function."""
+    """Yields the words of every command, for example (`library`, `encode`), with the command's function."""
     for command in app.registered_commands:
         name = command.name or command.callback.__name__.replace("_", "-")
         yield (*path, name), command.callback
@@ -17,7 +17,7 @@ def commands(app=cli.app, path=()):
 
 
 def parameters(function):
-    """Name, type and declaration of each parameter of a command; optional ones by the type that they have if given."""
+    """Yields name, type and declaration of each parameter of a command. The type of `int | None` counts as `int`."""
     for name, hint in get_type_hints(function, include_extras=True).items():
         if name == "return" or not hasattr(hint, "__metadata__"):
             continue
@@ -26,7 +26,7 @@ def parameters(function):
 
 
 def numbers():
-    """(words of the command, option, its declaration) of all numbers that commands take."""
+    """Yields (words of the command, option, declaration of the option) for every option that takes a number."""
     for words, function in commands():
         for name, kind, info in parameters(function):
             if kind in (int, float) and isinstance(info, OptionInfo):

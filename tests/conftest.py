@@ -1,4 +1,4 @@
-"""What several test files share."""
+"""Fixtures and settings for all test files."""
 
 import os
 import shutil
@@ -11,18 +11,18 @@ from material_cases import PLAIN
 
 from nma import cli, llvm
 
-# What is compiled is kept apart from the user's cache, and shared by all workers, programs and runs of the tests:
-# folders in it are named by the digest of what they were made from.
+# Tests keep compiled code in a cache of their own, apart from the user's. All workers, programs and runs of the tests
+# share it. The digest of the sources names each folder in it.
 CACHE = Path(__file__).parents[1] / "build/tests"
 os.environ["XDG_CACHE_HOME"] = str(CACHE)
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "jax")
-# XLA's older emitters take half the time to compile what trains here.
+# XLA's older emitters compile the training steps of the tests in half the time.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 
 @pytest.fixture
 def old_library(tmp_path: Path) -> str:
-    """A libLLVM from before 16, which cannot tell its version: one of the system's, or an imitation."""
+    """The path of a libLLVM older than 16, which cannot report its version. If the system has none, we imitate one."""
     for path in llvm.candidates():
         if llvm._version_of_name(path) < 16:
             return path
@@ -38,7 +38,7 @@ def old_library(tmp_path: Path) -> str:
 
 @pytest.fixture(scope="session")
 def compiler() -> str:
-    """A C++ compiler."""
+    """The path of a C++ compiler. Tests that need one are skipped on machines without it."""
     found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if found is None:
         pytest.skip("there is no C++ compiler here")
@@ -47,7 +47,10 @@ def compiler() -> str:
 
 @pytest.fixture(scope="session")
 def measurements() -> Path:
-    """The folder of measured materials: NMA_TEST_DATA, or one beside the checkout; the repository holds none."""
+    """The folder of measured materials: NMA_TEST_DATA, or shared/data beside the checkout.
+
+    The repository holds no measurements. Tests that need them are skipped without them.
+    """
     named = os.environ.get("NMA_TEST_DATA")
     folder = Path(named or Path(__file__).parents[2] / "shared/data")
     missing = [name for name in ("rgl", "rgl_nbrdf", "merl_nbrdf") if not (folder / name).is_dir()]
@@ -62,7 +65,7 @@ def measurements() -> Path:
 
 @pytest.fixture(scope="session")
 def untrained(tmp_path_factory) -> Path:
-    """The weights file of a small adapter that has learnt nothing."""
+    """The weights file of a small untrained adapter."""
     import numpy as np
 
     from nma import network
@@ -79,7 +82,7 @@ def untrained(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def nma(monkeypatch, capsys):
-    """Runs `nma ARGUMENTS` in this process: exit status, stdout, stderr."""
+    """A function that runs `nma ARGUMENTS` in this process and returns (exit status, stdout, stderr)."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["nma", *map(str, arguments)])
@@ -94,7 +97,7 @@ def nma(monkeypatch, capsys):
 
 @pytest.fixture
 def material_file(tmp_path):
-    """Writes a material file, PLAIN with some text replaced, and returns its path."""
+    """A function that replaces text in PLAIN, writes the result as a material file, and returns its path."""
 
     def write(old: str = "", new: str = "") -> Path:
         assert old in PLAIN

@@ -1,20 +1,22 @@
-"""Whether samples follow a density over the hemisphere: chi-square tests that several test files share."""
+"""Chi-square tests of samples against a density over the hemisphere. Several test files share them."""
 
 from collections.abc import Callable
 
 import numpy as np
 from scipy.stats import chi2
 
-# Bins of cos(theta) and azimuth, and parts of each along both, at whose middles the density is taken.
+# The numbers of bins in cos(theta) and in azimuth. Each bin is split into PARTS x PARTS cells, and the density is
+# evaluated at the centre of each cell.
 BINS, PARTS = (24, 48), 64
 GRID_POINTS = BINS[0] * BINS[1] * PARTS**2
 
 
 def p_values(sample: Callable, density: Callable) -> tuple[float, float]:
-    """Of samples against their density; and against one that is a tenth off at both ends, which must be seen.
+    """Returns two p-values: of the samples against their density, and of the samples against a wrong density.
 
-    `sample(n)` gives directions (n, 3) and densities (n,), 0 for those below the horizon, which have a bin of their
-    own; `density(wo)` gives the densities of directions (n, 3).
+    The error of the wrong density rises from -10 % in the first bin to +10 % in the last. A test must reject it.
+    `sample(n)` returns directions (n, 3) and densities (n,). A density of 0 marks a direction below the horizon; all
+    such directions share one extra bin. `density(wo)` returns the densities of directions (n, 3).
     """
     samples = GRID_POINTS // BINS[0]
     wo, pdf = sample(samples)
@@ -29,7 +31,7 @@ def p_values(sample: Callable, density: Callable) -> tuple[float, float]:
 
 
 def chi_square(found, wanted):
-    """The p-value; bins that expect fewer than ten are taken together."""
+    """Returns the p-value of a chi-square test. Bins that expect fewer than ten samples are merged."""
     few = wanted < 10
     found = np.append(found[~few], found[few].sum())
     wanted = np.append(wanted[~few], max(wanted[few].sum(), 1e-3))
@@ -39,7 +41,7 @@ def chi_square(found, wanted):
 
 
 def _grid():
-    """The middles of all parts of bins, rows of z after each other."""
+    """Returns the centres of all cells as directions (n, 3), ordered by z first and by azimuth second."""
     z, phi = ((np.arange(n * PARTS) + 0.5) / (n * PARTS) for n in BINS)
     z, phi = (x.ravel() for x in np.meshgrid(z, 2 * np.pi * phi, indexing="ij"))
     r = np.sqrt(1 - z * z)

@@ -1,4 +1,4 @@
-"""A material file, and images for it, which several test files share."""
+"""The text of a material file, and a function that writes images. Several test files share them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What tests of the C++ runtime share: bridges to it, and arrays as C takes them."""
+"""Helpers for tests of the C++ runtime: they compile C++ files and convert arrays for C."""
 
 import ctypes
 import subprocess
@@ -14,7 +14,7 @@ FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", f"-I{
 
 
 def built(compiler, name, folder, *flags):
-    """The file `name` beside this one as a shared library."""
+    """Compiles the C++ file `name` of this folder, and returns it as a loaded shared library."""
     path = folder / f"{name}.so"
     subprocess.run([compiler, *FLAGS, *flags, "-shared", "-fPIC", HERE / name, "-o", path], check=True)
     return ctypes.CDLL(str(path))
@@ -25,15 +25,15 @@ def pointer(array):
 
 
 def rows(v):
-    """A `Vec3` of arrays as rows (n, 3)."""
+    """Converts a `Vec3` of arrays (n,) to an array (n, 3)."""
     return np.ascontiguousarray(stacked(v).T)
 
 
 def facing(cosines):
-    """Directions (n, 3) at azimuth 0."""
+    """Returns directions (n, 3) at azimuth 0 with the given cosines (n,)."""
     return np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=-1)
 
 
 def in_single_precision():
-    """Instruction sets of this CPU that compute in float32."""
+    """Lists the instruction sets of this CPU in which the runtime computes with float32."""
     return [name for name in available() if name != "avx512_bf16"]

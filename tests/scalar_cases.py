@@ -1,4 +1,4 @@
-"""Programs in Mitsuba's scalar renderer, whose plugins are compiled: processes that several test files start."""
+"""Runs test programs in Mitsuba's scalar renderer, with our compiled plugins, in processes of their own."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ MATERIAL = {
     "sigma_t": 0.5,
 }
 CHECKS = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.2, 0.1]}, "color1": 0.3}
-# What every program begins with: its variant and its arguments.
+# Every program begins with this text. It reads the arguments and sets the variant.
 PRELUDE = """
 import json, sys
 import mitsuba as mi
@@ -49,21 +49,21 @@ def interaction(cosine, azimuth=0.0):
 
 
 def plugins() -> Path:
-    """The folder of the compiled plugins; `conftest.py` says which cache it lies in."""
+    """Compiles the plugins and returns their folder. `conftest.py` chooses the cache that holds it."""
     if shutil.which("c++") is None:
         pytest.skip("there is no C++ compiler here")
     return build.build_mitsuba()
 
 
 def run(program: str, variant: str, *words) -> subprocess.CompletedProcess:
-    """A program after `PRELUDE`, whose `words` it finds as such."""
+    """Runs `PRELUDE` and then `program`, which finds the arguments in its variable `words`."""
     text = PRELUDE + textwrap.dedent(program)
     command = [sys.executable, "-c", text, json.dumps([variant, *words])]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 def finished(program: str, variant: str, *words) -> list[str]:
-    """The lines that it prints; whatever is wrong with it fails the test."""
+    """Runs a program and returns the lines that it prints. The test fails if the program fails."""
     done = run(program, variant, *words)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout.splitlines()

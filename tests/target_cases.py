@@ -5,7 +5,8 @@ import numpy as np
 from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 
-# Of `jax.jit`, where compiling takes longest: XLA fuses the target into kernels that are slow to make.
+# Arguments of `jax.jit` for tests that spend most of their time on compiling. They turn off the slow steps, because
+# XLA otherwise fuses the target into large kernels.
 FAST_COMPILE = {
     "compiler_options": {
         "xla_disable_hlo_passes": "fusion,cpu-instruction-fusion",
@@ -18,8 +19,10 @@ FAST_COMPILE = {
 def random_principled(
     rng: np.random.Generator, n: int, dialect: bool = True, fades: bool = False
 ) -> Principled:
-    """(n,) sets: widths spread over decades, pure cases frequent; `dialect` adds what the paper leaves out, `fades`
-    what Mitsuba's BSDF does not have."""
+    """Returns n random parameter sets. Widths spread over decades, and many parameters are exactly 0 or 1.
+
+    `dialect` adds the parameters that the paper leaves out, `fades` those that Mitsuba's BSDF does not have.
+    """
 
     def often_pure():
         u = rng.random(n)
@@ -48,13 +51,13 @@ def _fades(rng: np.random.Generator, n: int) -> dict:
 def random_blend(
     rng: np.random.Generator, n: int, n_instances: int, dialect: bool = True, fades: bool = False
 ) -> Blend:
-    """(n,) blends of instances with random weights that sum to one."""
+    """Returns n blends of random instances. The weights of each blend are random and sum to one."""
     weights = rng.dirichlet(np.ones(n_instances), n).T
     return Blend(tuple(random_principled(rng, n, dialect, fades) for _ in range(n_instances)), tuple(weights))
 
 
 def random_directions(rng: np.random.Generator, n: int) -> Vec3:
-    """(n,) directions above the horizon, uniform in the cosine; every tenth grazes."""
+    """Returns n random directions above the horizon, uniform in the cosine. Every tenth is near grazing."""
     z = rng.random(n)
     z = np.where(rng.random(n) < 0.1, 10.0 ** rng.uniform(-6, -1, n), z)
     phi = rng.uniform(0, 2 * np.pi, n)
@@ -63,7 +66,7 @@ def random_directions(rng: np.random.Generator, n: int) -> Vec3:
 
 
 def mapped(tree, f):
-    """The same nested tuples with `f` applied to every array; plain numbers stay."""
+    """Returns the same nested tuples with `f` applied to every array. Python numbers stay as they are."""
     if isinstance(tree, tuple):
         parts = [mapped(t, f) for t in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
@@ -71,5 +74,5 @@ def mapped(tree, f):
 
 
 def stacked(c: Vec3) -> np.ndarray:
-    """(3, ...) NumPy array of a triple of arrays of any library."""
+    """Converts a triple of arrays of any array library to a NumPy array (3, ...)."""
     return np.stack(np.broadcast_arrays(*(np.asarray(x) for x in c)))

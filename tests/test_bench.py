@@ -1,4 +1,4 @@
-"""What the benches of whole frames compute, and that each of them runs."""
+"""Tests of the benches that render whole frames: their statistics are right, and each bench runs."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from bench import density, frames, samples, scenes, settings
 from nma.render.scene import CAMERAS
 
 ROOT = Path(__file__).parent.parent
-# Those that draw what they found.
+# These benches also write a picture of their results.
 PICTURED = ["density", "networks", "render", "samples", "scalar", "settings", "teaser"]
 SIMULATION = {"seconds": 2.0, "variance": 0.4, "error": 0.4, "doubt": 0.03}
 ADAPTER = {"seconds": 1.0, "variance": 0.2, "error": 0.5, "doubt": 0.04}
@@ -26,7 +26,7 @@ def bench(*words):
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=900, check=False)
 
 
-def test_efficiencies_are_the_inverse_of_noise_times_time():
+def test_efficiency_is_the_inverse_of_noise_times_time():
     found = frames.ratios(ADAPTER, SIMULATION)
     expected = {"time": 0.5, "variance": 0.5, "error": 1.25, "efficiency by variance": 4.0}
     assert found == pytest.approx(expected | {"efficiency by error": 1.6})
@@ -37,12 +37,12 @@ def test_efficiencies_are_the_inverse_of_noise_times_time():
     assert unknown["efficiency by error"] is None
 
 
-def test_noise_may_drown_an_error():
+def test_there_is_no_ratio_of_errors_that_are_not_positive():
     assert frames.ratio(-0.1, 0.4) is None
     assert frames.ratio(0.1, 0.0) is None
 
 
-def test_means_are_geometric_and_skip_what_is_not_known():
+def test_means_are_geometric_and_skip_unknown_ratios():
     assert frames.geometric_mean([0.5, None, 2.0]) == pytest.approx(1.0)
     assert frames.geometric_mean([None]) is None
     twice = {**ADAPTER, "seconds": 4.0}
@@ -81,13 +81,13 @@ def test_the_error_is_variance_and_squared_bias_without_the_noise_of_the_converg
     for bias in (0.0, 0.3):
         pictures = noisy(rng, 1.0 + bias, 0.5, 8)
         found = frames.figures(frames.Frames(pictures, np.ones(8), np.ones(8)), reference)
-        # Without the subtraction it would be 0.09 more.
+        # The converged picture has a variance of 0.09. If it were not subtracted, the error would be 0.09 larger.
         assert found["variance"] == pytest.approx(0.25, rel=0.03)
         assert found["error"] == pytest.approx(0.25 + bias**2, rel=0.05)
         assert 0.0 < found["doubt"] < 0.05
 
 
-def test_parts_of_a_converged_picture_are_kept(tmp_path, monkeypatch):
+def test_parts_of_a_converged_picture_are_cached(tmp_path, monkeypatch):
     seeds = []
 
     def render(scene, spp, seed):
@@ -106,7 +106,7 @@ def test_parts_of_a_converged_picture_are_kept(tmp_path, monkeypatch):
     assert again.picture == pytest.approx((1 + 2 + 5 + 4) / 4)
 
 
-def test_tables_are_markdown_with_numbers_to_the_right():
+def test_tables_are_markdown_with_numbers_aligned_right():
     text = frames.markdown(["what", "time"], [["layered", 1.0], ["principled", None], ["nma", 0.0123]])
     assert text.splitlines() == [
         "| what       |     time |",
@@ -117,12 +117,12 @@ def test_tables_are_markdown_with_numbers_to_the_right():
     ]
 
 
-def test_levels_double_and_cheap_ones_have_more_runs():
+def test_sample_counts_double_and_small_ones_have_more_runs():
     assert samples.levels(16) == [1, 2, 4, 8, 16]
     assert [samples.repeats(spp, 3) for spp in (1, 16, 32, 1024)] == [96, 6, 3, 3]
 
 
-def test_flatness_is_the_largest_time_to_the_smallest():
+def test_flatness_is_the_largest_time_over_the_smallest():
     assert density.flatness({0.0: 2.0, 1.0: 3.0, 10.0: 2.5}) == 1.5
 
 
@@ -142,7 +142,7 @@ def test_lights_are_out_of_sight():
 
 
 @pytest.mark.parametrize("name", scenes.SCENES)
-def test_scenes_render_what_is_measured(name):
+def test_every_scene_renders_and_is_measured(name):
     import mitsuba as mi
 
     before = mi.variant()
@@ -159,7 +159,7 @@ def test_scenes_render_what_is_measured(name):
     assert found.seconds > 0.0
 
 
-def test_without_a_name_they_are_listed():
+def test_the_command_without_a_name_lists_all_benches():
     lines = bench().stdout.splitlines()
     names = [line.split()[0] for line in lines]
     assert {*PICTURED, "reciprocity", "runtime"} <= set(names)
@@ -171,7 +171,7 @@ def test_without_a_name_they_are_listed():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURED + ["reciprocity"])
-def test_quick(name, tmp_path):
+def test_every_bench_runs_in_its_quick_form(name, tmp_path):
     run = bench(name, "--quick", "--output", tmp_path)
     assert run.returncode == 0, run.stdout + run.stderr
     written = json.loads((tmp_path / f"{name}.json").read_text())

@@ -1,4 +1,4 @@
-"""What our BSDFs give denoisers and `aov` for the colour of a surface: their albedo at wi, at most 1, without noise."""
+"""Our BSDFs report their directional albedo at wi to denoisers and to `aov`. It is at most 1 and free of noise."""
 
 import mitsuba as mi
 import numpy as np
@@ -14,7 +14,7 @@ nma.render.use("llvm_ad_rgb")
 SAMPLES = 200_000
 ADAPTER = {"type": "nma", "adapter": "layered3-3x32"}
 GREY = {"sigma_t": bitmap_texture(np.full((2, 2, 1), 0.4))}
-# How far the fixed points of each kind may be from the mean of many samples.
+# The BSDFs, each with the largest allowed difference between its reported albedo and the mean of many samples.
 KINDS = {
     "nma": (ADAPTER | {"material": "gold-red-lacquer"}, 0.02),
     "nma, smooth": (ADAPTER | {"material": "wet-nickel"}, 0.02),
@@ -37,7 +37,7 @@ def interactions(n, cosine):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_albedo_is_that_of_samples(kind):
+def test_the_reported_albedo_is_the_mean_of_sample_weights(kind):
     description, error = KINDS[kind]
     bsdf, rng = mi.load_dict(description), mi.PCG32(SAMPLES)
     for cosine in (1.0, 0.5, 0.15):
@@ -50,7 +50,7 @@ def test_the_albedo_is_that_of_samples(kind):
         assert found.max() <= 1
 
 
-def test_the_albedo_is_at_most_one_and_the_back_is_black():
+def test_the_albedo_is_at_most_one_and_zero_from_behind():
     white = {"eta_conductor": 0.0, "k_conductor": 1.0, "albedo": 1.0, "alpha_top": 1e-4, "alpha_bottom": 1e-4}
     bsdf = mi.load_dict({"type": "layered", "eta_top": 1.5, "sigma_t": 1.0} | white)
     si = interactions(2, 0.3)
@@ -61,7 +61,7 @@ def test_the_albedo_is_at_most_one_and_the_back_is_black():
     assert (found[:, 1] == 0).all()
 
 
-def test_mitsuba_blends_albedos():
+def test_blendbsdf_blends_the_albedos_of_its_parts():
     parts = [{"type": "diffuse", "reflectance": 0.5}, ADAPTER | {"material": "gold-red-lacquer"}]
     both = mi.load_dict({"type": "blendbsdf", "weight": 0.25, "a": parts[0], "b": parts[1]})
     si = interactions(1, 0.6)

@@ -65,14 +65,14 @@ def test_channels_have_the_names_of_what_they_hold(nma, tmp_path, pixels, integr
         depth = values[..., found.index("d.T")]
         assert depth[4, 4] == pytest.approx(5.0, abs=0.1) and depth[0, 0] == 0
     if {"R", "Y", "X"} & set(found):
-        # In the corner the camera sees the sky: in whatever format, its colour or its luminance.
+        # In the corner the camera sees the sky. The picture holds its luminance if it is grey, else its colour.
         grey = "luminance" in pixels
         sky = np.full(3, np.dot(SKY, (0.2126, 0.7152, 0.0722))) if grey else np.array(SKY)
         np.testing.assert_allclose(read_image(tmp_path / "a.exr")[0, 0], sky, rtol=1e-3)
         np.testing.assert_allclose(read_image(tmp_path / "a.png")[0, 0], sky, rtol=0.03)
 
 
-def test_pictures_that_take_all_memory_are_refused_before_they_are_rendered(nma, tmp_path):
+def test_pictures_too_large_for_memory_are_refused_before_rendering(nma, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text(SCENE.format(integrator=PATH, pixels="rgb", size=9))
     for subject in ("gold-red-lacquer", path):
@@ -84,12 +84,12 @@ def test_pictures_that_take_all_memory_are_refused_before_they_are_rendered(nma,
 
 
 @pytest.mark.parametrize("size", ["0", "x", "16x", "16x16x16", "-4", "1e3", "\u00b2", "9" * 5000, "16x0"])
-def test_sizes_are_numbers(nma, size):
+def test_malformed_sizes_are_refused(nma, size):
     code, out, err = nma("render", "gold-red-lacquer", "--size", size)
     assert (code, out) == (2, "") and "Traceback" not in err
 
 
-def test_errors_of_several_lines_become_one(tmp_path):
+def test_an_error_of_several_lines_becomes_one_line(tmp_path):
     text = SCENE.format(integrator=PATH, pixels="rgb", size=9)
     inner = '<string name="material" value="wet-nickel"/><bsdf name="alpha_top" type="roughconductor"/>'
     (tmp_path / "scene.xml").write_text(
@@ -101,7 +101,7 @@ def test_errors_of_several_lines_become_one(tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_the_error_of_a_traceback_is_kept_whole():
+def test_the_message_after_a_traceback_is_kept_whole():
     trace = 'Traceback (most recent call last):\n  File "a.py", line 1, in f\n    g()\n'
     assert one_line(f"at line 3: {trace}ValueError: got A[\n  1\n]\n") == "at line 3: got A[ 1 ]"
     assert one_line(f"at x: {trace}mod.Bad: one\n\nDuring it:\n\n{trace}Worse: two") == "at x: two"

@@ -1,4 +1,4 @@
-"""One plain Principled BRDF for a material: the fit, its export to Mitsuba, and `nma principled`."""
+"""Fits one principled BRDF to a material: the fit, its export to Mitsuba, and the command `nma principled`."""
 
 import json
 from dataclasses import replace
@@ -23,19 +23,19 @@ from nma.target import Principled, eval_principled
 from nma.train.constant import CONSTANT, Constant, fit_constant
 
 RED = Principled(Color(0.7, 0.15, 0.05), 0.35, 0.1, 0.6, 0.2, 0.3, 0.5, 0.6, 0.8, flatness=0.2)
-# Shorter than what `nma principled` does, to save time.
+# The recipe of `nma principled` with fewer steps and points, to save time.
 SHORT = replace(CONSTANT, steps=400, rows=16, points=32)
 
 
 @pytest.fixture(scope="module")
 def red() -> Tables:
-    """The table of `RED`, from Mitsuba's own plugin."""
+    """The table of `RED`, tabulated from Mitsuba's own plugin."""
     return tabulate_values(from_dict(principled_dict(RED)), points=16)
 
 
 @pytest.fixture(scope="module")
 def coated(red) -> Tables:
-    """The same, said to be a layered material's, so that its class is known."""
+    """The same values, with parameters of a layered material, so that the table belongs to the class `layered3`."""
     return Tables(LAYERED3.sample(np.random.default_rng(0), 1), red.values, red.walks)
 
 
@@ -67,8 +67,12 @@ def test_the_best_of_several_fits_has_the_least_error_of_values_and_albedo(fit):
 
 
 @pytest.mark.slow
-def test_what_the_log_loss_leaves_out_is_not_left_dark():
-    """Copper under a blue medium and a smooth coat. By log loss alone it became 14 % too dark, albedo error .076."""
+def test_a_highlight_that_the_log_loss_ignores_keeps_its_energy():
+    """A fit to copper under a blue medium and a smooth coat keeps its brightness within 4 %.
+
+    A fit of the log loss alone was 14 % too dark, with an albedo error of .076. A failure means that the loss no longer
+    weighs the albedo.
+    """
     changes = {
         "alpha_top": 0.002,
         "alpha_bottom": 0.05,
@@ -111,7 +115,7 @@ def lanes(w: Vec3) -> Vec3:
 
 
 def instances() -> list[Principled]:
-    """Random parameters, and what Mitsuba writes in another way: no dielectric reflection, and a strong one."""
+    """Returns random parameters, and some at the ends of `specular`, for which the export may write `eta` instead."""
     many = random_principled(np.random.default_rng(4), 8)
     one = [
         Principled(Color(*(float(c[n]) for c in many.base_color)), *(float(x[n]) for x in many[1:11]))
@@ -129,7 +133,11 @@ def instances() -> list[Principled]:
 @pytest.mark.parametrize("p", instances())
 @pytest.mark.parametrize("form", ["dictionary", "XML"])
 def test_mitsuba_evaluates_the_export_to_the_same(p, form):
-    """2e-4 relative, off the horizon; clearcoats lose digits in single precision, as tests/test_target.py says."""
+    """Mitsuba's values of the exported BSDF equal ours within 2e-4 relative, away from the horizon.
+
+    The gloss of the clearcoat is limited to 0.8, because narrower clearcoats lose digits in single precision, as
+    tests/test_target.py explains. A failure means that the export writes a wrong parameter.
+    """
     p = p._replace(clearcoat_gloss=min(p.clearcoat_gloss, 0.8))
     bsdf = from_dict(principled_dict(p)) if form == "dictionary" else from_string(principled_xml(p))
     rng = np.random.default_rng(5)
@@ -140,7 +148,7 @@ def test_mitsuba_evaluates_the_export_to_the_same(p, form):
     np.testing.assert_allclose(value[:, compared], expected[:, compared], rtol=2e-4, atol=1e-6)
 
 
-def test_specular_is_written_as_eta_where_mitsuba_has_none():
+def test_specular_beyond_mitsuba_s_range_is_written_as_eta():
     assert principled_dict(RED)["specular"] == 0.6
     assert "eta" not in principled_dict(RED)
     for specular, eta in ((0.0, 1.00001), (1.6, 2.114153)):
@@ -150,7 +158,7 @@ def test_specular_is_written_as_eta_where_mitsuba_has_none():
 
 
 @pytest.mark.parametrize("change", [{"anisotropic": -2.0}, {"specular": 13.0}, {"roughness": float("nan")}])
-def test_what_mitsuba_does_not_allow_is_refused(change):
+def test_parameters_that_mitsuba_does_not_allow_are_refused(change):
     with pytest.raises(ParamError, match=next(iter(change))):
         principled_dict(RED._replace(**change))
 
@@ -160,7 +168,7 @@ def test_what_mitsuba_does_not_allow_is_refused(change):
 
 @pytest.fixture
 def fitted(fit, monkeypatch) -> list[tuple]:
-    """Makes the command find `fit` whatever it is given; lists the tables and records that it was given."""
+    """Makes the command return `fit` for every input. The fixture is the list of (tables, record) that it received."""
     given = []
 
     def find(tables, recipe, record, **options):
@@ -173,7 +181,10 @@ def fitted(fit, monkeypatch) -> list[tuple]:
 
 @pytest.mark.slow
 def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monkeypatch, tmp_path):
-    """The same as `fit_constant` finds: equal arguments give equal results, and a class without parameters will do."""
+    """The command prints the result of `fit_constant`, because equal arguments give equal results.
+
+    Its table here belongs to no class: the fit needs no parameters of the material.
+    """
     monkeypatch.setattr("nma.train.constant.CONSTANT", SHORT)
     red.save(tmp_path / "red.npz")
     code, out, err = nma("principled", tmp_path / "red.npz")
@@ -184,7 +195,7 @@ def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monke
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("brightness", "words"), [(0.8, "20.0 % too dark"), (1.1, "10.0 % too bright")])
-def test_numbers_that_cannot_show_the_material_come_with_a_warning(
+def test_a_fit_that_misses_the_albedo_comes_with_a_warning(
     nma, fit, red, monkeypatch, tmp_path, brightness, words
 ):
     red.save(tmp_path / "red.npz")

@@ -1,4 +1,4 @@
-"""The demonstration: pictures at once, figures when there are some."""
+"""The demonstration shows pictures at once, and adds figures as soon as they are measured."""
 
 import pytest
 from adapter_cases import random_adapter
@@ -12,7 +12,7 @@ nma.render.use("llvm_ad_rgb")
 
 
 @pytest.mark.slow
-def test_the_sheet_is_written_before_anything_is_measured_and_anew_with_figures(tmp_path, monkeypatch):
+def test_the_sheet_is_written_before_any_measurement_and_again_with_figures(tmp_path, monkeypatch):
     random_adapter(hidden="1x8").save(tmp_path / "tiny.safetensors")
     settings = Settings((16, 16), 4, 2, 4, str(tmp_path / "tiny.safetensors"))
     path, events = tmp_path / "demo.png", []
@@ -29,7 +29,7 @@ def test_the_sheet_is_written_before_anything_is_measured_and_anew_with_figures(
     assert (first[0], second[0]) == ("plain, first pictures", "textured, first pictures")
     assert measured == ["measured"] * 3 and plain[0] == "plain, with figures"
     assert events[-1][0] == "textured, with figures"
-    # One row, two, then the table below grows.
+    # The sheet has one row of pictures, later two. After that the table below the pictures grows.
     heights = [event[1] for event in events if event != "measured"]
     assert heights == sorted(heights) and len(set(heights)) == 4
     assert sum(samples) == total_samples(settings)

@@ -1,4 +1,4 @@
-"""The pages do what they say: their Python runs, block by block, and what they link to is there."""
+"""Tests of the documentation pages: every Python and C++ block runs, and every link has a target."""
 
 import re
 import shutil
@@ -22,13 +22,13 @@ import mitsuba as mi  # isort: skip
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/README.md"])
-# Pages whose blocks train, and blocks that others are told by a file of measurements or processes of their own.
+# The page whose blocks train, and the file of measurements that some blocks read.
 TRAINING = "docs/bring-your-own.md"
 MEASURED = "paper_white_rgb.bsdf"
 
 
 def blocks(language):
-    """What pages have in that language, under names such as docs/python.md-0."""
+    """Returns all code blocks in this language. The keys are page and index, for example docs/python.md-0."""
     return {
         f"{page.relative_to(ROOT)}-{number}": block
         for page in PAGES
@@ -44,7 +44,7 @@ SLOW = [name for name, text in PYTHON.items() if name.startswith(TRAINING) or "L
 
 @pytest.fixture
 def cheap(tmp_path, monkeypatch):
-    """A folder to work in; a tiny network in place of the shipped one, one sample per pixel, few steps."""
+    """A working folder in which blocks run fast: with a tiny network, one sample per pixel and few training steps."""
     load, tiny, render = Adapter.load, random_adapter(hidden="2x8"), mi.render
     shipped = lambda name: tiny if str(name) in nma.shipped() else load(name)
     monkeypatch.setattr(Adapter, "load", staticmethod(shipped))
@@ -59,20 +59,20 @@ def cheap(tmp_path, monkeypatch):
     mi.set_variant(variant)
 
 
-def test_there_are_blocks_in_every_page_about_python():
+def test_every_page_about_python_has_python_blocks():
     pages = {name.rpartition("-")[0] for name in PYTHON}
     assert {"README.md", "docs/mitsuba.md", "docs/python.md", "docs/materials.md", TRAINING} <= pages
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in PYTHON if name not in SLOW])
-def test_python_of_the_pages_runs(name, cheap):
+def test_python_blocks_of_the_pages_run(name, cheap):
     run_block(PYTHON[name], cheap)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW)
-def test_python_that_trains_runs(name, cheap, request):
+def test_python_blocks_that_train_run(name, cheap, request):
     if MEASURED in PYTHON[name]:
         shutil.copy(request.getfixturevalue("measurements") / "rgl" / MEASURED, cheap)
     if "library.safetensors" in PYTHON[name]:
@@ -84,7 +84,7 @@ def test_python_that_trains_runs(name, cheap, request):
 
 
 def run_block(text, folder):
-    """Runs it as a program would, and returns its names. Pictures are finite, files are written."""
+    """Runs a block as a program and returns its variables. Pictures must be finite, and files must be written."""
     text = text.replace("range(30)", "range(2)")
     if "__main__" in text:
         (folder / "block.py").write_text(text)
@@ -107,8 +107,8 @@ def small_library():
 
 
 @pytest.mark.parametrize("name", blocks("cpp"))
-def test_cpp_of_the_pages_compiles_and_runs(name, compiler, tmp_path):
-    """Its lines in `main`, after what they take as given."""
+def test_cpp_blocks_of_the_pages_compile_and_run(name, compiler, tmp_path):
+    """A C++ block compiles and runs as the body of `main`, after declarations of the variables that it assumes."""
     includes, lines = blocks("cpp")[name].split("\n\n", 1)
     given = "float parameters[13] = {.02f, .1f, 1.5f, .1f, .4f, 1.4f, 4.f, 2.4f, 1.6f, .9f, .3f, .2f, .5f};\n"
     given += "const nma::Direction wi{.6f, 0.f, .8f}, wo{0.f, .6f, .8f};\nconst float u0 = .1f, u1 = .2f, u2 = .3f;\n"
@@ -127,7 +127,7 @@ def test_cpp_of_the_pages_compiles_and_runs(name, compiler, tmp_path):
 
 
 def test_links_between_pages_lead_somewhere():
-    """To files that are there, and headings that they have."""
+    """Every link of a page leads to an existing file, and to an existing heading of that file if it names one."""
     broken = []
     for page in PAGES:
         for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
@@ -141,6 +141,6 @@ def test_links_between_pages_lead_somewhere():
 
 
 def headings(page):
-    """The names that links call headings by: lower case, hyphens for blanks, no punctuation."""
+    """Lists the anchors of the headings of a page: lower case, hyphens for blanks, no punctuation."""
     titles = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
     return [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]

@@ -1,4 +1,4 @@
-"""The pages do what they say: their commands are understood, and run, page by page, in the order that they stand in."""
+"""Tests of the commands in the documentation pages: `nma` parses all, and runs those of each page in their order."""
 
 import re
 import shlex
@@ -22,7 +22,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/REA
 
 
 def lines(page):
-    """The commands of a page: lines of blocks that are in no language, without comments."""
+    """Returns the commands of a page: the lines of its code blocks without a language, without comments."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.M | re.S)
     text = "".join(body for language, body in blocks if not language)
     return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
@@ -30,7 +30,7 @@ def lines(page):
 
 COMMANDS = {str(p.relative_to(ROOT)): [w[1:] for w in lines(p) if w[0] == "nma"] for p in PAGES}
 COMMANDS = {page: commands for page, commands in COMMANDS.items() if commands}
-# Added to what a page says, to save time: later options replace earlier ones.
+# Options that the tests append to a command to save time. A later option replaces an earlier one.
 CHEAP = {
     "demo": "--size 16 --spp 1 --runs 2 --reference-spp 2",
     "render": "--size 16 --spp 1",
@@ -42,12 +42,12 @@ CHEAP = {
     "train-library": "--steps 50",
     "library encode": "--steps 50",
 }
-# What only those have who have measurements.
+# Only users with the measured materials have these files.
 MEASURED = ("paper_white_rgb.bsdf", "merl_nbrdf_weights.npz", "rgl-isotropic_nbrdf_weights.npz")
 
 
 def cheap(words):
-    """The command with less of everything."""
+    """Returns the command with options that make it fast: fewer samples, walks, steps and materials."""
     text = " ".join(words)
     more = next((options for start, options in CHEAP.items() if text.startswith(start)), "")
     if "--draw" in words:
@@ -62,7 +62,7 @@ def cheap(words):
 
 
 def parsed(words):
-    """Reads a command line as `nma` would, and does nothing."""
+    """Parses a command line as `nma` does, without running it. Returns the context of the command."""
     command, context = typer.main.get_command(cli.app), None
     name, rest = "nma", list(words)
     while True:
@@ -74,12 +74,12 @@ def parsed(words):
 
 
 @pytest.mark.parametrize("page", COMMANDS)
-def test_commands_of_the_pages_are_understood(page):
+def test_nma_parses_the_commands_of_the_pages(page):
     for words in COMMANDS[page]:
         parsed(words)
 
 
-def test_a_command_that_is_not_is_not_understood():
+def test_the_parser_refuses_unknown_commands_and_options():
     for words in (
         ["render", "wet-nickel", "--sizes", "16"],
         ["paint"],
@@ -89,7 +89,7 @@ def test_a_command_that_is_not_is_not_understood():
             parsed(words)
 
 
-def test_goals_of_make_are_there():
+def test_the_makefile_has_every_goal_that_pages_name():
     goals = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M))
     wanted = {words[1] for page in PAGES for words in lines(page) if words[0] == "make"}
     wanted |= {goal for page in PAGES for goal in re.findall(r"`make ([\w-]+)", page.read_text())}
@@ -98,7 +98,7 @@ def test_goals_of_make_are_there():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """What users of the pages have: files of their own, and measured materials where NMA_TEST_DATA has some."""
+    """A folder with the files that readers of the pages are assumed to have, all but the measured materials."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "home/merl").mkdir(parents=True)
@@ -126,7 +126,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def measured_files(folder, origin):
-    """Copies of measurements, with few of the networks."""
+    """Copies the measurements from `origin` to `folder`, with only a few networks of each file."""
     shutil.copy(origin / "rgl" / MEASURED[0], folder)
     for place, wanted in (("merl_nbrdf", None), ("rgl_nbrdf", "cg_sunflower_rgb")):
         (source,) = (origin / place).glob("*.npz")

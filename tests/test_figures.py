@@ -1,4 +1,4 @@
-"""Every experiment of `figures/` runs in its quick form and leaves its results: a new one is tested on arrival."""
+"""Every experiment of `figures/` runs in its quick form and writes its results. New experiments are found by name."""
 
 import json
 import subprocess
@@ -20,7 +20,7 @@ def figures(*words):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_quick(name, request):
+def test_every_experiment_runs_in_its_quick_form(name, request):
     if name in NEED_DATA:
         request.getfixturevalue("measurements")
     folder = ROOT / "out/figures" / name
@@ -42,7 +42,7 @@ def test_committed_results_stand_beside_each_script():
         assert list(home.glob("*.png")), f"{name} has no picture"
 
 
-def test_without_a_name_they_are_listed():
+def test_the_command_without_a_name_lists_all_experiments():
     lines = figures().stdout.splitlines()
     assert [line.split()[0] for line in lines] == EXPERIMENTS
     assert all(len(line.split()) > 3 for line in lines)

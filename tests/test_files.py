@@ -1,4 +1,4 @@
-"""Files are whole or not there, and what cannot be written is refused beforehand."""
+"""Files are written completely or not at all. Outputs that cannot be written are refused before any work."""
 
 import errno
 import os
@@ -25,7 +25,7 @@ def contents(folder: Path) -> list[str]:
 
 @pytest.fixture
 def places(tmp_path) -> dict[str, Path]:
-    """Outputs that cannot be, by what is wrong with them."""
+    """Paths that cannot be written. The keys are words of the error that each must raise."""
     (tmp_path / "folder.npz").mkdir()
     (tmp_path / "file").write_text("mine")
     return {
@@ -38,7 +38,7 @@ def places(tmp_path) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("write", [try_file, lambda path: write_bytes(path, b"content")])
-def test_what_cannot_be_written_is_refused_in_one_line_that_says_why(places, tmp_path, write):
+def test_an_unwritable_path_is_refused_in_one_line_that_says_why(places, tmp_path, write):
     before = contents(tmp_path)
     for reason, path in places.items():
         with pytest.raises(OutputError) as error:
@@ -77,7 +77,7 @@ def test_a_failed_write_keeps_the_old_file_and_nothing_else(tmp_path):
     assert path.read_text() == "old"
 
 
-def test_a_folder_is_whole_or_not_there(tmp_path):
+def test_a_folder_is_written_completely_or_not_at_all(tmp_path):
     with pytest.raises(ZeroDivisionError), whole_folder(tmp_path / "made") as folder:
         (folder / "half").touch()
         1 / 0  # noqa: B018
@@ -87,7 +87,7 @@ def test_a_folder_is_whole_or_not_there(tmp_path):
     assert contents(tmp_path) == ["new", "new/made", "new/made/all"]
 
 
-def test_of_two_who_make_a_folder_the_first_wins(tmp_path):
+def test_if_two_writers_make_a_folder_the_first_wins(tmp_path):
     with whole_folder(tmp_path / "made") as late:
         (late / "file").write_text("late")
         with whole_folder(tmp_path / "made") as early:
@@ -110,8 +110,8 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("writer", WRITERS)
-def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, writer):
-    """Whoever writes does so by `whole`, whose last step fails here, as it would on a full disk."""
+def test_a_full_disk_raises_one_line_and_leaves_no_file(tmp_path, monkeypatch, writer):
+    """Every writer uses `whole`, whose last step fails here as on a full disk: one line is raised, no file remains."""
     monkeypatch.setattr(Path, "replace", _full)
     with pytest.raises(OutputError, match="No space left on device.*free some space"):
         WRITERS[writer](tmp_path / "a.png")
@@ -125,7 +125,7 @@ def test_a_full_disk_is_noticed_by_the_trial(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("content", [b"", b"title = 'x'", pickle.dumps([1])])
-def test_what_is_no_archive_is_refused_without_advice_to_unpickle_it(tmp_path, content):
+def test_a_file_that_is_no_archive_is_refused_without_advice_to_unpickle_it(tmp_path, content):
     path = tmp_path / "gold.npz"
     path.write_bytes(content)
     for read in (Tables.load, nbrdf.read):

@@ -1,4 +1,4 @@
-"""Every file is written by `nma.files`, whole or not at all: the code is searched for other ways to write one."""
+"""All code writes files by `nma.files`, completely or not at all. The tests search the code for other ways."""
 
 import ast
 from collections.abc import Iterator
@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-# What writes, renames or copies files, whatever it is called on.
+# Methods and functions that write, rename or copy files, on any object and in any module.
 WRITERS = {"write_text", "write_bytes", "save_file", "savez", "savez_compressed", "savefig", "tofile"}
 WRITERS |= {"NamedTemporaryFile", "mkstemp", "mkdtemp", "rename", "copytree", "copyfile", "copy2", "move"}
-# And what does so in these modules.
+# Functions that write or rename files, with their modules. Their names alone would match other functions.
 OF_MODULES = {"np.save", "json.dump", "os.replace"}
-# Within these blocks a file or folder is filled that takes its place at the end.
+# Blocks of these context managers fill a temporary file or folder, which gets its final name at the end.
 WHOLE = {"whole", "whole_folder"}
 ALLOWED = {
     "nma/files.py": "what all others go through",
@@ -28,7 +28,7 @@ def code() -> list[Path]:
 
 
 def writes(tree: ast.AST) -> Iterator[ast.Call]:
-    """The calls that write a file themselves, outside of blocks that make it whole."""
+    """Yields the calls that write a file outside of the blocks named in `WHOLE`."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.With) and any(name(item.context_expr) in WHOLE for item in node.items):
             continue
@@ -38,7 +38,7 @@ def writes(tree: ast.AST) -> Iterator[ast.Call]:
 
 
 def name(node: ast.AST) -> str:
-    """The last part of what is called: `whole` of files.whole(path)."""
+    """Returns the last part of the name of a called function: `whole` for files.whole(path)."""
     return ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
 
 
@@ -55,18 +55,18 @@ def is_write(call: ast.Call) -> bool:
             if isinstance(arg, ast.Constant)
         ]
         return any(isinstance(text, str) and text[:1] in "wax" and len(text) < 4 for text in mode)
-    # Texts take two arguments, fields of data classes keywords.
+    # `str.replace` has two arguments and `dataclasses.replace` has keywords. `Path.replace` has one argument.
     return name(call) == "replace" and "." in called and len(call.args) == 1 and not call.keywords
 
 
-def test_files_are_written_whole_everywhere():
+def test_all_code_writes_files_by_nma_files():
     found = []
     for file in code():
         place = str(file.relative_to(ROOT))
         for call in writes(ast.parse(file.read_text())):
             if place not in ALLOWED and f"{place}: {name(call)}" not in ALLOWED:
                 found.append(f"{place}:{call.lineno}: {ast.unparse(call)[:60]}")
-    assert not found, "write these by nma.files, which leaves no half of a file behind:\n" + "\n".join(found)
+    assert not found, "write these by nma.files, which leaves no partial file behind:\n" + "\n".join(found)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_files_are_written_whole_everywhere():
         "shutil.copytree(here, there)",
     ],
 )
-def test_the_search_finds_what_writes(line):
+def test_the_search_finds_calls_that_write(line):
     assert list(writes(ast.parse(line)))
 
 
@@ -101,5 +101,5 @@ def test_the_search_finds_what_writes(line):
         "path.open('rb')",
     ],
 )
-def test_the_search_passes_over_what_does_not(line):
+def test_the_search_passes_over_calls_that_do_not_write(line):
     assert not list(writes(ast.parse(line)))

@@ -17,7 +17,7 @@ from nma.images.sheet import Row, contact_sheet
 
 @pytest.fixture(scope="module")
 def picture() -> np.ndarray:
-    """A smooth picture with a range of 0.02 to about 4."""
+    """A smooth picture with values from 0.02 to about 4."""
     x, y = np.meshgrid(np.linspace(0.0, 1.0, 48), np.linspace(0.0, 1.0, 32))
     return np.stack([0.02 + x, 0.02 + y * y, 0.02 + 4.0 * x * y], axis=-1).astype(np.float32)
 
@@ -30,19 +30,19 @@ def test_equal_images_have_no_error(picture):
 
 
 def test_plain_errors_follow_their_formulas():
-    """One pixel pair a = 3, b = 1 in every channel, eps = .01."""
+    """The expected errors are computed by hand, from a = 3 and b = 1 in every pixel and channel and eps = .01."""
     result = errors(np.full((2, 2, 3), 3.0), np.full((2, 2, 3), 1.0))
     expected = {"l1": 2.0, "l2": 4.0, "mape": 2 / 1.01, "smape": 4 / 4.01, "mrse": 4 / 1.01}
     assert result == pytest.approx(expected, rel=1e-9)
 
 
 def test_errors_grow_with_the_difference(picture):
-    """SSIM is left out: it ignores most of a change of brightness."""
+    """Every metric but SSIM is larger for the larger difference. SSIM ignores most of a change of brightness."""
     small, large = (compare_images(picture * factor, picture) for factor in (1.05, 1.3))
     assert all(large[name] > small[name] > 0.0 for name in METRICS if name != "ssim")
 
 
-def test_structure_is_what_ssim_sees(picture):
+def test_ssim_sees_noise_rather_than_brightness(picture):
     noise = 0.2 * np.random.default_rng(0).normal(size=picture.shape)
     assert (
         compare_images(picture + noise, picture)["ssim"]
@@ -51,8 +51,8 @@ def test_structure_is_what_ssim_sees(picture):
     )
 
 
-def test_exposure_decides_what_ldr_metrics_see(picture):
-    """A difference beyond white shows after lowering the exposure."""
+def test_ldr_metrics_see_differences_beyond_white_only_at_lower_exposure(picture):
+    """A difference beyond white is clipped, so that the LDR metric is zero. A lower exposure shows the difference."""
     bright = picture + 2.0
     clipped = compare_images(bright * 1.2, bright)
     lowered = compare_images(bright * 1.2, bright, ldr_exposure=-4.0)
@@ -89,7 +89,7 @@ def test_too_small_images_are_refused_for_ssim():
         compare_images(np.ones((8, 8, 3)), np.ones((8, 8, 3)))
 
 
-def test_missing_library_names_the_extra(picture, monkeypatch):
+def test_the_error_of_a_missing_package_names_the_extra(picture, monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     with pytest.raises(
         MissingDependencyError, match=r"in a checkout of this project run: pip install '\.\[compare\]'"
@@ -109,14 +109,14 @@ def test_difference_pictures(picture):
 
 
 def test_tonemap_is_srgb():
-    """Known pairs of the transfer curve; a stop doubles; clipping at both ends."""
+    """The tone curve gives known pairs of sRGB values. One stop of exposure doubles the input, and both ends clip."""
     linear = np.array([-1.0, 0.0, 0.001, 0.18, 0.5, 1.0, 9.0])
     expected = np.array([0.0, 0.0, 0.01292, 0.46135612, 0.73535698, 1.0, 1.0])
     np.testing.assert_allclose(tonemap(linear), expected, atol=1e-6)
     np.testing.assert_allclose(tonemap(linear / 2.0, exposure=1.0), expected, atol=1e-6)
 
 
-def test_shoulder_is_smooth_and_keeps_what_lies_below():
+def test_the_shoulder_is_smooth_and_keeps_values_below_it():
     x = np.linspace(0.0, 3.0, 3001)
     plain, soft = tonemap(x), tonemap(x, shoulder=0.8)
     np.testing.assert_array_equal(soft[x <= 0.8], plain[x <= 0.8])
@@ -133,8 +133,8 @@ def test_exr_keeps_values(tmp_path: Path, picture):
     )
 
 
-def test_exr_on_one_core(tmp_path: Path):
-    """In a process of its own, which would hang where OpenEXR finds no second thread."""
+def test_exr_files_are_written_and_read_with_one_thread(tmp_path: Path):
+    """A process with one thread writes and reads an EXR file. A hang means that OpenEXR waits for a second thread."""
     program = (
         "import drjit, sys; drjit.set_thread_count(1)\n"
         "from nma.images.io import read_image, write_exr\n"
@@ -152,7 +152,7 @@ def test_png_holds_the_tonemapped_picture(tmp_path: Path, picture):
     np.testing.assert_allclose(read_image(path), np.minimum(picture / 2.0, 1.0), atol=0.01)
 
 
-def test_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path, picture, monkeypatch):
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path, picture, monkeypatch):
     path = write_png(tmp_path / "a.png", picture)
     before = path.read_bytes()
 

@@ -1,4 +1,4 @@
-"""The size of an image is read from its header, and one that takes all memory is refused by it."""
+"""The size of an image is read from its header. An image too large for memory is refused before it is decoded."""
 
 import struct
 import zlib
@@ -24,7 +24,7 @@ def _variant():
 
 
 def image(path, kind, width=7, height=5):
-    """A file of this kind."""
+    """Writes a black image file of this format and returns its path."""
     if kind in ("hdr", "pfm", "exr"):
         mi.Bitmap(np.zeros((height, width, 3), np.float32)).write(str(path))
     else:
@@ -33,7 +33,7 @@ def image(path, kind, width=7, height=5):
 
 
 def bomb(path, kind):
-    """A file that claims to be larger than it is."""
+    """Writes a small image file whose header claims a huge size, and returns its path."""
     content, large = image(path, kind).read_bytes(), 65_000 if kind in ("jpg", "tga") else 100_000
     old, new = (_written(kind, *size) for size in ((7, 5), (large, large)))
     assert old in content
@@ -42,7 +42,7 @@ def bomb(path, kind):
 
 
 def _written(kind, width, height):
-    """A size as headers of this kind have it."""
+    """Returns the bytes by which the header of this format states a size."""
     match kind:
         case "png":
             ihdr = b"IHDR" + struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
@@ -59,14 +59,14 @@ def _written(kind, width, height):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_the_size_is_that_of_the_image(tmp_path, kind):
+def test_the_header_has_the_size_of_the_image(tmp_path, kind):
     path = image(tmp_path / f"a.{kind}", kind)
     assert header_size(path) == (7, 5)
     assert read_image(path).shape == (5, 7, 3)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_an_image_that_takes_all_memory_is_refused_by_its_header(tmp_path, monkeypatch, kind):
+def test_an_image_too_large_for_memory_is_refused_by_its_header(tmp_path, monkeypatch, kind):
     path = bomb(tmp_path / f"bomb.{kind}", kind)
     assert path.stat().st_size < 2000
     monkeypatch.setattr(mi, "Bitmap", None)
@@ -74,7 +74,7 @@ def test_an_image_that_takes_all_memory_is_refused_by_its_header(tmp_path, monke
         read_image(path)
 
 
-def test_textures_and_environment_maps_are_looked_at_too(tmp_path):
+def test_huge_textures_and_environment_maps_are_refused(tmp_path):
     texture = {"texture": str(bomb(tmp_path / "bomb.png", "png"))}
     material = materials.load("wet-nickel").changed({"alpha_top": texture}, "--set")
     with pytest.raises(NmaError, match="bomb.png claims"):
@@ -83,7 +83,7 @@ def test_textures_and_environment_maps_are_looked_at_too(tmp_path):
         preview_scene({"type": "diffuse"}, envmap=bomb(tmp_path / "bomb.hdr", "hdr"))
 
 
-def test_scene_files_that_name_such_an_image_are_refused(tmp_path):
+def test_scene_files_that_name_a_huge_image_are_refused(tmp_path):
     (tmp_path / "textures").mkdir()
     bomb(tmp_path / "textures" / "bomb.png", "png")
     texture = '<texture type="bitmap"><string name="filename" value="textures/bomb.png"/></texture>'
@@ -97,7 +97,7 @@ def test_scene_files_that_name_such_an_image_are_refused(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"\xff\xd8", b"\xff\xd8\xff\xff\xff\xff", b"BM", b"P6 1", b"no image at all"]
 )
-def test_what_is_no_image_has_no_size(tmp_path, content):
+def test_a_file_that_is_no_image_has_no_size(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
     assert header_size(tmp_path / "a.png") is None
     with pytest.raises(ImageError, match="a.png") as error:

@@ -1,4 +1,4 @@
-"""The Mitsuba BSDF `layered`: its methods agree with each other, its inputs are checked, its images are unbiased."""
+"""The Mitsuba BSDF `layered`: its methods agree with each other, it checks its inputs, and its images are unbiased."""
 
 import mitsuba as mi
 import numpy as np
@@ -40,7 +40,7 @@ WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0, "albedo": 1.0}
 
 
 def interactions(n, seed=0, cos_theta=None):
-    """Surface interactions with random wi, or with the given cosine, and random places."""
+    """Returns n surface interactions at random places with random wi, or with wi at the given cosine."""
     rng = mi.PCG32(n, seed)
     u = [rng.next_float32() for _ in range(6)]
     si = dr.zeros(mi.SurfaceInteraction3f, n)
@@ -56,7 +56,7 @@ def samples(bsdf, si, rng):
     return bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
 
 
-def test_methods_agree():
+def test_the_methods_of_the_bsdf_agree():
     bsdf, ctx = mi.load_dict(LACQUER), mi.BSDFContext()
     si, rng = interactions(1000)
     bs, weight = samples(bsdf, si, rng)
@@ -72,7 +72,7 @@ def test_methods_agree():
     assert dr.all(~left | (dr.abs(bsdf.pdf(ctx, si, bs.wo) - bs.pdf) <= 1e-5 * bs.pdf))
     assert dr.all(left | dr.all(weight == 0))
     assert dr.all(~left | ((bs.wo.z > 0) & (bs.eta == 1) & (dr.abs(dr.norm(bs.wo) - 1) < 1e-4)))
-    # The same arguments draw the same estimate, whichever method is asked.
+    # All methods draw the same estimate from the same arguments.
     for a, b in ((bsdf.eval(ctx, si, wo), value), (joint_value, value), (joint_weight, weight2)):
         np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-4, atol=1e-6)
     for a, b in ((bsdf.pdf(ctx, si, wo), pdf), (joint_pdf, pdf), (joint_bs.pdf, bs2.pdf)):
@@ -85,7 +85,7 @@ def test_evaluation_and_sampling_have_the_same_albedo():
     for cos_theta in (0.95, 0.4):
         si, rng = interactions(n, 1, cos_theta)
         _, weight = samples(bsdf, si, rng)
-        # Directions drawn by an unrelated cosine density.
+        # These directions follow a cosine density, which is unrelated to the BSDF.
         wo = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
         value = bsdf.eval(ctx, si, wo) * (dr.pi / wo.z)
         a, b = np.array(weight, np.float64), np.array(value, np.float64)
@@ -191,7 +191,10 @@ def test_xml_and_named_materials():
 
 
 def scene(size, **integrator):
-    """Two materials, one textured and one smooth, under a constant sky and a lamp; direct light and one bounce."""
+    """Loads a scene of a textured ball on a smooth floor, under a constant sky and a lamp.
+
+    The integrator computes direct light and one bounce.
+    """
     patches = np.random.default_rng(0).uniform(0.05, 0.9, (4, 8, 3)).astype(np.float32)
     floor = {**LACQUER, "alpha_top": 0.02, "alpha_bottom": 0.15, "sigma_t": 0.2}
     ball = {**LACQUER, "albedo": bitmap_texture(patches), "alpha_bottom": bitmap_texture(patches[..., :1])}
@@ -216,7 +219,7 @@ def scene(size, **integrator):
 
 
 def register_bsdf_sampling():
-    """A path tracer that finds lights by sampling the BSDF alone."""
+    """Registers a path tracer that finds lights only by sampling the BSDF."""
 
     class BsdfSampling(mi.SamplingIntegrator):
         def __init__(self, props):
@@ -242,7 +245,10 @@ def register_bsdf_sampling():
 
 
 def same_image(a, b):
-    """Whether two measurements have the same mean: in every pixel, in blocks, on the whole (false alarm 3 x 1 %)."""
+    """Tests whether two measurements have equal means, and returns the verdict and the worst deviations.
+
+    There are three tests, with a false-alarm rate of 1 % each: per pixel, in blocks of 8 x 8, and over the whole image.
+    """
     tests = {
         n: zscore_images(a.mean, a.variance, 8, b.mean, b.variance, 8, block=n, rounding=1e-4)
         for n in (1, 8, 32)
@@ -253,13 +259,16 @@ def same_image(a, b):
 
 @pytest.mark.slow
 def test_light_sampling_equals_bsdf_sampling(monkeypatch):
-    """Next-event estimation with MIS against BSDF sampling alone; a value off by 3 % would be seen."""
+    """Next-event estimation with MIS renders the same image as BSDF sampling alone (false alarm 3 x 1 %).
+
+    A failure means that `eval` or `pdf` does not match `sample`. The test detects values that are 3 % too large.
+    """
     register_bsdf_sampling()
     both = measure(scene(32, type="path"), 128, 8, warmup=False)
     alone = measure(scene(32, type="bsdf_sampling"), 512, 8, warmup=False)
     same, worst = same_image(both, alone)
     assert same, worst
-    # The lamp is small, and looking for it must pay.
+    # The lamp is small, so that sampling it directly must reduce the variance.
     assert 4 * alone.mean_variance > both.mean_variance
 
     evaluate = layered_eval.evaluate
@@ -269,7 +278,7 @@ def test_light_sampling_equals_bsdf_sampling(monkeypatch):
 
 
 def test_white_furnace():
-    """A lossless material under a uniform sky is invisible, whichever way its light is found."""
+    """A lossless material under a uniform sky is invisible (false alarm .1 %). A failure means that energy is lost."""
     material = {**LACQUER, **WHITE, "alpha_top": 1e-4, "alpha_bottom": 1e-4, "sigma_t": 1.0}
     description = {
         "type": "scene",
@@ -284,13 +293,13 @@ def test_white_furnace():
     }
     result = measure(mi.load_dict(description), 1024, 6, warmup=False)
     one = np.ones_like(result.mean)
-    # Facets this narrow still mask some grazing light below the coat: .1 %.
+    # Even facets this narrow mask .1 % of the light, which grazes them below the coat.
     same = zscore_images(result.mean, result.variance, 6, one, 0 * one, 1, rounding=1e-3, false_alarm=1e-3)
     assert same.passed, f"p {same.p_values.min():.1e} below {same.level:.1e} at {same.worst}"
 
 
-def test_scenes_loaded_one_after_the_other_know_their_composites():
-    """What the last scene left, names and addresses alike, says nothing about this one."""
+def test_a_scene_s_composites_do_not_depend_on_the_scenes_loaded_before():
+    """`blended` tells whether a BSDF is part of a composite, even if names and addresses of an older scene recur."""
     blend = {"type": "blendbsdf", "weight": 0.5, "a": LACQUER, "b": {"type": "diffuse"}}
     kept = []
     for composite in (True, False, True, True, False, False):

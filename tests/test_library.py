@@ -1,4 +1,4 @@
-"""Libraries: many materials in one network, their file, codes of new materials, and the folders they come from."""
+"""Libraries of many materials in one network: training, files, codes of new materials, folders of measurements."""
 
 import math
 from dataclasses import replace
@@ -38,12 +38,12 @@ TINY = replace(
     steps=250,
 )
 CODING = replace(TINY, steps=150, learning_rate=5e-2)
-# What 250 steps must reach; they start above .02.
+# Training must reach this log loss within 250 steps. It starts above .02.
 REACHED = 0.003
 
 
 def matte(rho):
-    """Tables of Lambertian materials, without noise; their parameters are their numbers."""
+    """Returns noise-free tables of Lambertian materials with albedos `rho` (n, 3). Their parameter is their index."""
     cosines = (np.arange(40) + 0.5) / 40
     values = rho[:, None, None, None, :] / math.pi * cosines[None, None, :, None, None]
     values = np.broadcast_to(values, (len(rho), *ISOTROPIC.shape)).astype(np.float32)
@@ -78,7 +78,7 @@ def test_a_hundred_materials_have_7159_parameters():
     assert Library(adapter, tuple(map(str, range(100))), codes).parameters == 7_159
 
 
-def test_three_materials_are_learned(made, library, tables):
+def test_training_learns_three_materials(made, library, tables):
     run = made[1]
     assert np.mean(run.log_losses[-50:]) < REACHED < np.mean(run.log_losses[:50])
     own = Tables(library.codes[:1].astype(np.float64), tables.values[:1], tables.walks[:1])
@@ -93,7 +93,7 @@ def test_codes_stay_within_the_range_of_the_class(library):
     np.testing.assert_array_equal(LIBRARY.check(library.codes, "training"), library.codes)
 
 
-def test_a_library_comes_back_and_is_an_adapter(library, saved):
+def test_a_library_is_read_back_from_its_file_and_is_an_adapter(library, saved):
     again = Library.load(saved)
     assert again.names == NAMES
     assert again.parameters == library.parameters
@@ -134,7 +134,7 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(made, tables, tmp_path,
 
 
 @pytest.mark.slow
-def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
+def test_encoding_a_new_material_beats_the_nearest_code(library, tables):
     layers = [(matrix.copy(), bias.copy()) for matrix, bias in library.adapter.layers]
     found = training.encode(library, tables[3:], recipe=CODING)
     assert found.nearest in NAMES
@@ -144,7 +144,7 @@ def test_a_new_material_is_encoded_better_than_by_the_nearest(library, tables):
     for (matrix, bias), (before, bias_before) in zip(library.adapter.layers, layers, strict=True):
         np.testing.assert_array_equal(matrix, before)
         np.testing.assert_array_equal(bias, bias_before)
-    # Each that the library knows is nearest to itself.
+    # The nearest code to each material of the library is its own.
     nearest = [
         np.argmin(training._judge(library.codes, library, tables[k : k + 1], CODING)) for k in range(3)
     ]
@@ -214,7 +214,7 @@ def xml(path, rho):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Three of Mitsuba's BSDFs, and what is no material."""
+    """A folder with three Mitsuba BSDFs, and with a page and a folder that are no materials."""
     folder = tmp_path_factory.mktemp("materials")
     for name, rho in zip(NAMES, COLOURS[:3], strict=True):
         xml(folder / f"{name}.xml", rho)
@@ -223,7 +223,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_folders_files_and_weights_of_many_are_collections(folder, tmp_path, measurements):
+def test_folders_single_files_and_files_of_many_networks_are_collections(folder, tmp_path, measurements):
     assert [member.name for member in collection.members(folder)] == sorted(NAMES)
     assert [member.name for member in collection.members(folder / "red.xml")] == ["red"]
     assert collection.origin(collection.members(folder)) == "*.xml"
@@ -241,7 +241,7 @@ def test_a_merl_file_is_a_collection_of_one(tmp_path):
     assert isinstance(member.read(), Merl)
 
 
-def test_collections_without_sense_are_refused(folder, tmp_path):
+def test_empty_missing_and_ambiguous_collections_are_refused(folder, tmp_path):
     with pytest.raises(SourceError, match="no such folder or file; `nma data`"):
         collection.members(tmp_path / "nowhere")
     with pytest.raises(SourceError, match="holds no material; files of materials end in .binary"):
@@ -252,7 +252,7 @@ def test_collections_without_sense_are_refused(folder, tmp_path):
         collection.members(tmp_path)
 
 
-def test_tables_are_kept_until_their_file_changes(folder, tmp_path, monkeypatch):
+def test_tables_are_cached_until_their_file_changes(folder, tmp_path, monkeypatch):
     made, plain = [], collection.tabulate_values
     monkeypatch.setattr(
         collection, "tabulate_values", lambda values: (made.append(values.name), plain(values, points=16))[1]
@@ -278,7 +278,7 @@ def test_tables_are_kept_until_their_file_changes(folder, tmp_path, monkeypatch)
 
 
 @pytest.mark.slow
-def test_the_commands(nma, folder, tmp_path, monkeypatch):
+def test_the_commands_train_list_encode_and_extract(nma, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "RECIPE", TINY)
     monkeypatch.setattr(training, "ENCODING", CODING)
     made, more, one = (tmp_path / "new" / f"{name}.safetensors" for name in ("made", "more", "one"))

@@ -1,4 +1,4 @@
-"""Paths from the light see the BSDF `nma` as those from the camera do, though its blends are not reciprocal."""
+"""Paths from the light and paths from the camera evaluate the same BSDF, although `nma` is not reciprocal."""
 
 import json
 
@@ -53,7 +53,11 @@ def interaction(wi):
 
 @pytest.mark.parametrize("material", [MATERIAL, TEXTURED, STRETCHED, CONSTANT])
 def test_values_from_the_light_are_those_from_the_camera(folder, material, monkeypatch):
-    """f itself, with view and light in their places; samples are drawn by the density that is reported for them."""
+    """With the roles of `wi` and `wo` swapped, light paths evaluate the same f(view, light) as camera paths do.
+
+    Samples of light paths have the pdf and the value that `eval_pdf` returns. A failure means that light tracing and
+    path tracing render different materials.
+    """
     monkeypatch.chdir(folder)
     bsdf, rng = mi.load_dict(material), mi.PCG32(2000)
     drawn = lambda: mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -71,7 +75,7 @@ def test_values_from_the_light_are_those_from_the_camera(folder, material, monke
     np.testing.assert_allclose(weight * bs.pdf, value, rtol=2e-3, atol=1e-5)
 
 
-def test_light_from_behind_or_to_behind_is_none():
+def test_light_from_below_or_to_below_the_surface_is_black():
     bsdf, up, down = mi.load_dict(MATERIAL), mi.Vector3f(0.6, 0.0, 0.8), mi.Vector3f(0.0, 0.6, -0.8)
     for wi, wo in (
         (up, down),
@@ -84,7 +88,7 @@ def test_light_from_behind_or_to_behind_is_none():
 
 
 def scene(integrator):
-    """A plate under a small lamp near its horizon, seen from above: each of few pixels holds much of the light."""
+    """Loads a scene of a plate, seen from above, under a small lamp near its horizon. The picture is 4 x 4 pixels."""
     look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     return mi.load_dict(
         {
@@ -108,26 +112,29 @@ def scene(integrator):
 
 
 def mean(integrator, spp, runs=8):
-    """Of the picture, RGB, and its standard error over independent runs."""
+    """Returns the mean colour (3,) of the picture, and its standard error over independent runs."""
     loaded = scene(integrator)
     each = [np.array(mi.render(loaded, spp=spp, seed=k)).mean(axis=(0, 1)) for k in range(runs)]
     return np.mean(each, axis=0), np.std(each, axis=0, ddof=1) / runs**0.5
 
 
 def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
-    """Means within 4.5 standard errors, of seven degrees of freedom: a false alarm in some hundred."""
+    """The mean colours of both integrators agree within 4.5 standard errors.
+
+    The errors have seven degrees of freedom, which makes a false alarm in about a hundred runs; seeds are fixed.
+    """
     wanted, doubt = mean("path", 1024)
     found, error = mean("ptracer", 16384)
     assert (error < 0.01 * wanted).all()
     assert (np.abs(found - wanted) < 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
-    # Prepared at the light's side, as they were once, they are told apart.
+    # If the parameters are prepared for the direction of the light instead, the test detects the difference.
     monkeypatch.setattr(Adapter, "reciprocal", True)
     found, error = mean("ptracer", 16384)
     assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
 
 
-# Prints, for pairs of directions: f as seen from the camera, f as a path from the light finds it, and f with the
-# directions swapped; then what a sample is worth, and the value of its direction.
+# Prints five colours for each random pair of directions: f for a camera path, f for a light path, f for a camera path
+# with swapped directions, weight times pdf of a sample, and the value of the direction of this sample.
 SCALAR = """
     rng = np.random.default_rng(0)
     light = mi.BSDFContext(mi.TransportMode.Importance)
@@ -154,7 +161,7 @@ SCALAR = """
 
 
 @pytest.mark.slow
-def test_the_scalar_plugin_does_the_same(folder):
+def test_the_scalar_plugin_has_the_same_values_for_light_paths(folder):
     plugins()
     bsdfs = [{**PLAIN, "adapter": str(folder / "stretched.safetensors")}, {**PLAIN, "online": True}]
     rows = np.array([json.loads(line) for line in finished(SCALAR, "scalar_rgb", *bsdfs)])

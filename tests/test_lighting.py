@@ -1,4 +1,4 @@
-"""The lightings of the preview scene: what they hold, what noise they leave, and clamping of what remains."""
+"""The lightings of the preview scene: their lights, the noise of their pictures, and clamping of fireflies."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ POLISHED = {"type": "roughconductor", "alpha": 0.02}
 
 
 def at(image, direction):
-    """The pixel of a latitude-longitude image that lies closest to a direction."""
+    """Returns the pixel of a latitude-longitude image that lies closest to a direction."""
     unit = np.array(direction) / np.linalg.norm(direction)
     return image.reshape(-1, 3)[np.argmax(sky_directions(len(image)).reshape(-1, 3) @ unit)]
 
@@ -32,7 +32,7 @@ def render(lighting, spp, size=48, seed=0, bsdf=POLISHED, **options):
     )
 
 
-def test_softboxes_hang_where_they_say():
+def test_softboxes_hang_at_their_stated_directions():
     image = studio_radiance()
     for box in SOFTBOXES:
         added = at(image, box.towards) - at(image, -np.array(box.towards) * [1, 1, -1])
@@ -48,7 +48,10 @@ def test_the_studio_has_no_small_bright_light_and_a_dark_horizon():
 
 @pytest.mark.slow
 def test_the_studio_leaves_weaker_fireflies_than_outdoors():
-    """What pixels of a polished ball have beyond five times the converged picture, at 16 samples."""
+    """Fireflies of a polished ball are five times weaker in the studio than outdoors, at 16 samples per pixel.
+
+    A firefly is the part of a pixel beyond five times its converged value.
+    """
     beyond = {}
     for lighting in LIGHTINGS:
         converged = render(lighting, 256, size=32, seed=1).mean(axis=2)
@@ -57,8 +60,11 @@ def test_the_studio_leaves_weaker_fireflies_than_outdoors():
     assert beyond["studio"] < 0.2 * beyond["outdoors"]
 
 
-def test_outdoors_stays_what_results_were_measured_in():
-    """The committed results of benches and figures: the picture's mean as they saw it."""
+def test_outdoors_is_the_lighting_of_the_committed_results():
+    """The mean colour of a picture stays as it was when the results of benches and figures were committed.
+
+    A failure means that the lighting has changed, so that new results cannot be compared with the committed ones.
+    """
     image = render("outdoors", 256, size=32, seed=3, bsdf=GREY)
     assert image.mean(axis=(0, 1)) == pytest.approx([0.2899, 0.2851, 0.2839], rel=0.01)
 
@@ -69,7 +75,7 @@ def test_the_floor_reflects_less_than_it_receives(lighting):
     assert 0.0 < reflectance.min() < reflectance.max() < 0.6
 
 
-def test_light_is_refused_where_there_is_no_such():
+def test_unknown_lightings_and_a_missing_sun_are_refused():
     with pytest.raises(ParamError, match="unknown lighting 'indoors'; take studio or outdoors"):
         preview_scene(GREY, lighting="indoors")
     with pytest.raises(ParamError, match="no sun to hide"):
@@ -77,8 +83,11 @@ def test_light_is_refused_where_there_is_no_such():
 
 
 @pytest.mark.parametrize(("spp", "pixels"), [(128, 512 * 512), (64, 256 * 256), (100, 192 * 192), (7, 64)])
-def test_multijittered_samples_are_taken_where_they_fill_a_grid(spp, pixels, capfd):
-    """Mitsuba rounds other numbers up, and warns."""
+def test_multijittered_samples_fill_a_grid(spp, pixels, capfd):
+    """`sampler` chooses multijitter only for sample counts that Mitsuba takes as they are.
+
+    Mitsuba rounds other counts up, and warns. A failure means that a picture has more samples than the user asked for.
+    """
     kind = sampler(spp, pixels)
     for samples in pass_sizes(spp, pixels):
         taken = mi.load_dict({"type": kind, "sample_count": samples}).sample_count()
@@ -86,15 +95,15 @@ def test_multijittered_samples_are_taken_where_they_fill_a_grid(spp, pixels, cap
     assert capfd.readouterr().out == ""
 
 
-def test_the_command_asks_for_no_number_that_mitsuba_warns_of(capfd):
-    """128 samples are no grid, two passes of 64 are."""
+def test_the_command_asks_for_no_sample_count_that_mitsuba_warns_of(capfd):
+    """Mitsuba would warn of 128 samples, which fill no grid. The command asks for two passes of 64, which fill one."""
     view = View((192, 192), 128, 6, "hero", "studio", None, "llvm_ad_rgb")
     assert sampler(128, 192 * 192) == "multijitter"
     view.load(load_material("wet-nickel"), "layered")
     assert "WARN" not in "".join(capfd.readouterr())
 
 
-def test_nearly_all_numbers_of_samples_can_be_multijittered():
+def test_nearly_all_sample_counts_can_be_multijittered():
     kinds = [sampler(spp, 512 * 512) for spp in range(1, 513)]
     assert kinds.count("multijitter") > 490
 
@@ -147,6 +156,6 @@ def test_clamping_only_darkens_and_removes_fireflies():
         ({"type": "aov", "aovs": "n:sh_normal"}, "beside other channels"),
     ],
 )
-def test_clamping_is_refused_where_it_would_do_something_else(integrator, message):
+def test_clamping_is_refused_for_integrators_whose_samples_are_not_paths(integrator, message):
     with pytest.raises(ParamError, match=message):
         clamped(mi.load_dict(integrator), 1.0)

@@ -35,12 +35,12 @@ def test_passes_average_to_one_picture_and_equal_seeds_repeat_it(monkeypatch):
     assert done == [2, 2, 1]
     assert image.shape == (12, 12, 3) and image.dtype == np.float32
     np.testing.assert_array_equal(image, render_passes(scene, 5, seed=3))
-    # Seed 4 shares no pass with seed 3, in whatever order.
+    # No pass of seed 4 has the same random numbers as a pass of seed 3.
     other = render_passes(scene, 5, seed=4)
     assert (image != other).all(axis=2).mean() > 0.9
 
 
-def test_errors_of_mitsuba_while_it_renders_are_one_line(monkeypatch):
+def test_errors_of_mitsuba_during_rendering_become_one_line(monkeypatch):
     def fails(*args, **kwargs):
         raise RuntimeError("[integrator.cpp:12] this scene\nis beyond me")
 
@@ -54,7 +54,7 @@ def test_a_scene_without_an_integrator_is_not_rendered():
         render_passes(load_dict(EMPTY), 1)
 
 
-def test_no_samples_are_refused():
+def test_zero_samples_are_refused():
     with pytest.raises(ParamError, match="at least 1"):
         render_passes(load_dict(EMPTY), 0)
 
@@ -96,7 +96,7 @@ def test_faulty_scene_files_are_refused(tmp_path, text, message):
         load_scene(tmp_path / "scene.xml")
 
 
-def test_a_material_becomes_a_dictionary_of_either_model():
+def test_a_material_becomes_a_dictionary_for_either_bsdf():
     material = materials.load("gold-red-lacquer")
     adapter = material_bsdf(material, adapter="my.safetensors", clamp=True)
     assert (adapter["type"], adapter["adapter"], adapter["clamp"]) == ("nma", "my.safetensors", True)
@@ -108,8 +108,11 @@ def test_a_material_becomes_a_dictionary_of_either_model():
 
 
 @pytest.mark.parametrize("model", ["nma", "layered"])
-def test_images_of_a_material_repeat_as_often_as_it_says(model, tmp_path):
-    """By the file's name in a scene, and by its dictionary: three times along uv."""
+def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
+    """With `uv_scale = 3` an image repeats three times along u.
+
+    That holds for a material that a scene names by its file, and for one that is given as a dictionary.
+    """
     pixels = np.zeros((1, 8, 3), np.uint8)
     pixels[:, 2:4, 0] = 255
     Image.fromarray(pixels).save(tmp_path / "image.png")
@@ -125,8 +128,11 @@ def test_images_of_a_material_repeat_as_often_as_it_says(model, tmp_path):
 
 
 @pytest.mark.parametrize("model", ["nma", "layered"])
-def test_textures_of_eight_bits_are_what_they_evaluate_to(model, tmp_path):
-    """Byte 20 is .078 raw, and .007 of linear light; alpha_top of `wet-nickel` may be .001 to .316 for the adapter."""
+def test_textures_of_eight_bits_are_checked_by_the_values_they_evaluate_to(model, tmp_path):
+    """Byte 20 evaluates to .078 if the texture is `raw`, otherwise to .007 in linear light. Both values are accepted.
+
+    The adapter accepts `alpha_top` from .001 to .316, so that byte 0 is refused.
+    """
     Image.fromarray(np.full((4, 4), 20, np.uint8)).save(tmp_path / "grey.png")
     bsdf = material_bsdf(materials.load("wet-nickel"), model)
     bitmap = {"type": "bitmap", "filename": str(tmp_path / "grey.png")}
@@ -138,7 +144,7 @@ def test_textures_of_eight_bits_are_what_they_evaluate_to(model, tmp_path):
 
 
 @pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="there is an NVIDIA GPU")
-def test_variants_for_a_device_that_is_not_there_are_refused():
+def test_variants_for_a_missing_device_are_refused():
     with pytest.raises(
         MissingDependencyError, match="cuda_ad_rgb needs an NVIDIA GPU.*llvm_ad_rgb needs none"
     ):

@@ -1,4 +1,4 @@
-"""What `bench/reciprocity.py` measures: how far an adapter is from reciprocal."""
+"""Tests of `bench/reciprocity.py`, which measures how far an adapter is from reciprocal."""
 
 import numpy as np
 from adapter_cases import materials, random_adapter
@@ -8,22 +8,25 @@ from bench import reciprocity
 MATERIAL = materials(1)[0]
 
 
-def test_constant_parameters_are_reciprocal():
+def test_adapters_with_constant_parameters_are_reciprocal():
     found = reciprocity.measured(random_adapter(directional=False), MATERIAL, 4000)
     assert np.abs(list(found.values())).max() < 1e-9
 
 
 def test_both_orders_reflect_the_same_over_all_directions():
-    """By the symmetry of the integral: within four standard errors, in each of three channels."""
+    """The integral over both directions is symmetric, so that swapping wi and wo does not change it.
+
+    In each of the three channels the means agree within four standard errors (false alarm 2e-4 in all).
+    """
     n, rng = 1 << 15, np.random.default_rng(1)
     both = reciprocity.pairs(random_adapter(), MATERIAL, np.sqrt(rng.random(n)), rng)
     off = both.swapped - both.forward
     assert (np.abs(off.mean(axis=1)) < 4.0 * off.std(axis=1) / n**0.5).all()
-    # Pair by pair they differ by far more than that.
+    # Single pairs differ by far more than the mean does.
     assert (np.abs(off).mean(axis=1) > 10.0 * np.abs(off.mean(axis=1))).all()
 
 
-def test_parameters_that_follow_the_direction_are_not():
+def test_adapters_that_follow_the_direction_are_not_reciprocal():
     found = reciprocity.measured(random_adapter(), MATERIAL, 4000)
     assert set(found) == {"difference", *(f"cos {c}" for c in reciprocity.COSINES)}
     assert np.min(found["difference"]) > 0.02

@@ -1,4 +1,4 @@
-"""The rooms of the package: their imports go downwards, and the committed drawing shows them."""
+"""The rooms of the package import only from lower floors, and the committed drawing shows all rooms and imports."""
 
 import re
 
@@ -25,7 +25,7 @@ def test_rooms_and_floors_are_few_enough_to_remember():
     assert len(floors) <= MOST_FLOORS
 
 
-def test_the_committed_drawing_is_that_of_the_imports():
+def test_the_committed_drawing_shows_the_current_imports():
     assert OUT.read_text() == drawing(), (
         "the rooms, their imports or their docstrings have changed: run `python -m tools.map`, look at the drawing"
     )
@@ -53,19 +53,19 @@ def test_imports_that_cannot_be_drawn_are_refused(more, told, monkeypatch):
         drawing()
 
 
-def test_a_step_of_the_data_needs_an_import(monkeypatch):
+def test_a_step_of_the_data_is_refused_without_an_import(monkeypatch):
     monkeypatch.setattr(map, "WAY", (*WAY, map.Step("data", "cli", "nothing")))
     with pytest.raises(SystemExit, match="data and cli do not import each other"):
         drawing()
 
 
-def test_the_listing_says_what_each_room_is():
+def test_the_listing_describes_each_room():
     lines = listing().splitlines()
     assert [line.split()[1] for line in lines] == [room for floor in rooms.floors() for room in floor]
     assert all(len(line.split()) > 3 for line in lines)
 
 
-def test_arrows_that_a_longer_way_goes_are_left_out():
+def test_an_arrow_is_left_out_if_a_longer_way_leads_there():
     arrows = frozenset([("cli", "table"), ("table", "params"), ("cli", "params"), ("cli", "errors")])
     assert rooms.reduced(arrows) == arrows - {("cli", "params")}
 
@@ -76,7 +76,7 @@ def test_circles_are_found():
     assert rooms.circle(way | {("params", "table")}) == ["cli", "params", "table"]
 
 
-def test_a_room_is_told_by_the_longest_beginning_that_fits(tmp_path, monkeypatch):
+def test_the_summary_of_a_room_is_the_longest_beginning_that_fits(tmp_path, monkeypatch):
     monkeypatch.setattr(rooms, "ROOT", tmp_path)
     (tmp_path / rooms.PACKAGE).mkdir()
     (tmp_path / rooms.PACKAGE / "attic.py").write_text(
@@ -102,7 +102,10 @@ def test_the_page_names_registries_that_are_there():
 
 @pytest.fixture
 def ladder():
-    """Boxes whose order on the lower floor is the reverse of what suits their arrows; one passes a floor."""
+    """Three floors of boxes, and the arrows between them. One arrow passes a floor.
+
+    The boxes of the second floor are in the wrong order: their arrows would cross.
+    """
     floors = [["a", "b", "c"], ["z", "y", "x"], ["end"]]
     return floors, [("a", "x"), ("b", "y"), ("c", "z"), ("a", "end"), ("z", "end")]
 
@@ -122,5 +125,5 @@ def test_boxes_keep_their_distance(ladder):
         assert all(b - a >= 10.0 - 1e-9 for a, b in zip(ends, ends[1:], strict=False))
 
 
-def test_places_are_the_same_each_time(ladder):
+def test_the_layout_is_the_same_each_time(ladder):
     assert layout(*ladder, box=10.0, passage=2.0) == layout(*ladder, box=10.0, passage=2.0)

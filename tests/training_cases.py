@@ -1,4 +1,4 @@
-"""A small recipe, tables and networks that the tests of training share."""
+"""A small recipe, tables and networks for the tests of training."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ from nma.train.recipe import CLASS
 FALSE_ALARM = 1e-3
 TINY = replace(CLASS, network="2x8", rows=16, bins_per_row=4, points=4, steps=250, learning_rate=1e-2)
 
-# A target to be found again: brass under a varnish, as two instances.
+# Training must recover this target: brass under a varnish, as two instances.
 BRASS = Blend(
     (
         Principled(Color(0.9, 0.7, 0.4), 0.45, 1.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.5),
@@ -29,7 +29,7 @@ BRASS = Blend(
 
 
 def lambertian(n, walks=819_200):
-    """Tables of n matte materials that differ in colour: rho / pi cos(theta_o) in each bin, without noise."""
+    """Returns noise-free tables of n Lambertian materials of random colours. Each bin holds rho / pi cos(theta_o)."""
     params = LAYERED3.sample(np.random.default_rng(0), n)
     rho = params[:, LAYERED3.slices["albedo"]]
     cosines = (np.arange(40) + 0.5) / 40
@@ -47,12 +47,15 @@ def means_of(layers, batch, recipe):
 
 
 def constant_layers(blend, inputs=1, params=PRINCIPLED_PARAMS):
-    """A network of one layer that says `blend` whatever it sees."""
+    """Returns a network of one layer whose output is `blend` for every input."""
     raw = np.array(target.encode(blend, params), np.float32)
     return [(np.zeros((len(raw), inputs), np.float32), raw)]
 
 
 def constant_adapter(blend, params=PRINCIPLED_PARAMS):
-    """One that says `blend` whatever it sees, but for what fades with the direction."""
+    """Returns an adapter whose network outputs `blend` for every input.
+
+    With `STRETCHED_PARAMS` the decoder still fades the stretching with the direction.
+    """
     layers, in_plane = constant_layers(blend, params=params), params is STRETCHED_PARAMS
     return Adapter(LAYERED3, "direction", layers, len(blend.instances), in_plane, params)
