@@ -22,7 +22,7 @@ PRINTING = {"training": ["--steps", "60"], "walks": ["--walks", "81920", "--repe
 def benches() -> dict[str, Path]:
     """Name and script of every bench. A bench is a file in this folder that can be run."""
     scripts = sorted(HERE.glob("*.py"))
-    return {s.stem: s for s in scripts if s != Path(__file__) and "__main__" in s.read_text()}
+    return {s.stem: s for s in scripts if s != Path(__file__) and '__name__ == "__main__"' in s.read_text()}
 
 
 def main() -> None:
