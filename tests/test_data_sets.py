@@ -1,4 +1,4 @@
-"""`nma data`: what it says of the data sets, and that it finds what is wrong with a copy."""
+"""`nma data`: its list of data sets, and its check of a user's copies."""
 
 import shutil
 from functools import partial
@@ -14,7 +14,7 @@ from nma.sources.merl import Merl
 
 @pytest.fixture
 def data(nma):
-    """Runs `nma data ARGUMENTS`: exit status, stdout, stderr."""
+    """Runs `nma data ARGUMENTS` and returns (exit status, stdout, stderr)."""
     return partial(nma, "data")
 
 
@@ -74,13 +74,13 @@ def test_faults_are_named_file_by_file(data, uniform, measurements):
     (folder / "paper_white_rgb.bsdf").write_bytes(paper[:-1])
     (folder / "sub").mkdir()
     shutil.copy(measurements / "rgl" / "cg_sunflower_rgb.bsdf", folder / "sub" / "mine_rgb.bsdf")
-    # Sound, and of the right size, but another file.
+    # A sound file of the right size, but not the original one.
     changed = bytearray(paper)
     changed[200_000] ^= 1
     (folder / "sub" / "paper_white_rgb.bsdf").write_bytes(changed)
     (folder / "merl_nbrdf_weights.npz").write_bytes(b"damaged")
     np.savez(folder / "networks.npz", names=np.array(["a"]), weights=np.zeros((1, 3)))
-    # Files of other kinds are none of its business.
+    # Files of other kinds are ignored.
     np.savez(folder / "reference.npz", table=np.zeros(3))
     (folder / "notes.txt").write_text("nothing")
     code, out, err = data("check", folder)

@@ -1,4 +1,4 @@
-"""Datasets on disk: the same bytes however they were made, and clear errors where they are not whole."""
+"""Datasets on disk: they have the same bytes however they were made, and incomplete ones give clear errors."""
 
 import json
 import os
@@ -18,7 +18,8 @@ from nma.table.dataset import Dataset, Settings, draw_params, simulate_block
 
 SETTINGS = Settings("layered3", 24, 40_000, 7)
 
-# Writes the dataset of argv[1] in blocks of argv[2]; once argv[3] materials are done, it dies argv[4] seconds later.
+# Writes the dataset argv[1] in blocks of argv[2] materials. The process kills itself argv[4] seconds after argv[3]
+# materials are done.
 WORKER = """
 import os, signal, sys, threading
 from nma.table import dataset
@@ -42,14 +43,14 @@ def start_worker(path: Path, block: int, fatal: int = 1000, delay: float = 0.0) 
 
 
 def chunks(path: Path) -> dict[str, bytes]:
-    """The bytes of every whole chunk of a dataset."""
+    """The bytes of every complete chunk of a dataset."""
     files = [p for p in (path / "c").rglob("*") if p.is_file() and not p.name.endswith(".partial")]
     return {str(p.relative_to(path)): p.read_bytes() for p in files}
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Dataset:
-    """The dataset, written at once by one worker."""
+    """The dataset, written by one worker without a break."""
     data = Dataset.create(tmp_path_factory.mktemp("data") / "whole.zarr", SETTINGS)
     data.write()
     return data
@@ -57,7 +58,7 @@ def whole(tmp_path_factory) -> Dataset:
 
 @pytest.fixture
 def copy(whole, tmp_path) -> Dataset:
-    """A copy to be damaged."""
+    """A copy of the dataset that a test may damage."""
     shutil.copytree(whole.path, tmp_path / "copy.zarr")
     return Dataset.open(tmp_path / "copy.zarr")
 
@@ -83,7 +84,7 @@ def test_blocks_do_not_change_the_result(whole, tmp_path, monkeypatch):
     by_fives = Dataset.create(tmp_path / "five.zarr", SETTINGS)
     by_fives.write()
     assert chunks(by_fives.path) == chunks(whole.path)
-    # Few walks may be lost, so materials of many walks come in smaller blocks.
+    # A killed run must not lose many walks, so materials with many walks are simulated in smaller blocks.
     monkeypatch.setattr(dataset, "_BLOCK_WALKS", 40_000)
     sizes = []
     monkeypatch.setattr(
@@ -105,7 +106,7 @@ def test_two_workers_write_one_dataset(whole, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_killed_three_times_and_resumed_equals_an_uninterrupted_one(whole, tmp_path):
-    """SIGKILL, at random moments after some more materials are done."""
+    """Each run ends by SIGKILL, at a random moment after some more materials are done."""
     path, moments, missing = tmp_path / "killed.zarr", random.Random(1), 24
     for _ in range(3):
         fatal = 24 - missing + moments.randint(1, 4)
@@ -122,7 +123,7 @@ def test_a_run_killed_three_times_and_resumed_equals_an_uninterrupted_one(whole,
 
 
 def test_a_chunk_that_was_not_finished_does_not_count(copy):
-    """What a kill leaves is a temporary file beside the chunk's place."""
+    """A killed run leaves a temporary file beside the chunk's own path."""
     chunk = Path(copy._chunk(5))
     chunk.rename(chunk.with_suffix(".0123456789abcdef.partial"))
     assert copy.missing().tolist() == [5]
@@ -133,7 +134,7 @@ def test_a_chunk_that_was_not_finished_does_not_count(copy):
 
 
 def test_a_writer_that_fails_leaves_no_chunk(tmp_path, monkeypatch):
-    """The promise of atomic writes is zarr's; this fails if a version of it breaks the promise."""
+    """zarr promises atomic writes. This test fails if a version of zarr breaks the promise."""
     data = Dataset.create(tmp_path / "full.zarr", Settings("layered3", 1, 40, 0))
 
     def full(self, target):

@@ -1,4 +1,4 @@
-"""The doctor, and the search for a libLLVM that Dr.Jit survives."""
+"""`nma.doctor`, and the search for a libLLVM that is new enough for Dr.Jit."""
 
 import os
 import shutil
@@ -11,7 +11,8 @@ import pytest
 from nma import doctor, llvm
 from nma.errors import MissingDependencyError
 
-# What a caller does before its first kernel, and a kernel that an old libLLVM dies of.
+# Calls `ensure_llvm`, as every program does before its first kernel, then runs a kernel that an old libLLVM cannot
+# compile.
 FIRST_KERNEL = """
 from nma.errors import NmaError
 from nma.llvm import ensure_llvm
@@ -26,7 +27,7 @@ else:
 
 
 def run(code: str, **environment: str) -> subprocess.CompletedProcess:
-    """Runs Python `code` in a fresh process, as a process loads one libLLVM for ever."""
+    """Runs Python `code` in a new process, because a process can load only one libLLVM."""
     kept = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE}
     return subprocess.run(
         [sys.executable, "-c", code], env=kept | environment, capture_output=True, text=True, timeout=60
@@ -62,7 +63,7 @@ def test_a_missing_library_is_refused(prelude, missing):
 
 @pytest.fixture
 def _fresh_search(monkeypatch):
-    """Forgets what earlier searches found, before and after."""
+    """Clears the cached results of the search for libLLVM before and after a test."""
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     for cached in (llvm._newest, llvm._examine):
         cached.cache_clear()

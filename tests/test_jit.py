@@ -1,4 +1,4 @@
-"""Dr.Jit is loaded with a libLLVM it survives, or the user learns what to do, in one line and before anything dies."""
+"""Dr.Jit gets a libLLVM that is new enough, or an error of one line says what to do before the process is killed."""
 
 import os
 import re
@@ -28,7 +28,7 @@ print(table.walks[0], os.environ["DRJIT_LIBLLVM_PATH"])
 
 
 def run(code: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess:
-    """Runs Python `code` in a fresh process, without this one's choice of libLLVM."""
+    """Runs Python `code` in a new process, which chooses its own libLLVM."""
     kept = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE}
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, env=kept | environment, capture_output=True, text=True, timeout=60)
@@ -71,7 +71,7 @@ def test_loading_dr_jit_loads_no_mitsuba():
 
 
 def test_modules_take_dr_jit_from_the_gate():
-    """At module level nobody imports Dr.Jit or Mitsuba itself, outside the packages whose `__init__` is a gate."""
+    """Outside `nma.render` and `nma.sources`, no module imports Dr.Jit or Mitsuba directly at its top level."""
     root = Path(nma.__file__).parent
     gated = ("render", "sources")
     for path in root.rglob("*.py"):

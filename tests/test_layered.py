@@ -1,6 +1,6 @@
-"""Evaluation of the layered source against its own walks, and the density that weighs it.
+"""The layered source: its evaluation, compared with its own random walks, and its sampling density.
 
-Every statistical test's chance of a false alarm is `FALSE_ALARM`, shared among its comparisons by Sidak's correction.
+A statistical test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's correction.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ FALSE_ALARM = 1e-3
 GRID = Grid(theta_i=5, theta_o=10, phi_o=10)
 WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
 
-# Pairs of narrow and wide lobes, thin and thick media, coats that bend light a lot, little, and not at all.
+# Narrow and wide lobes of coat and conductor, thin and thick media, and coats that refract light much, little or not.
 CASES = {
     "white_coated": {"alpha_top": 0.2, "alpha_bottom": 0.4, "eta_top": 1.5, "sigma_t": 0.0, **WHITE},
     "white_with_medium": {
@@ -53,7 +53,7 @@ def vector(values):
 
 
 def layers_of(values, n):
-    """The layers in n lanes; parameters are opaque, so that all materials share one kernel."""
+    """The stack in n lanes. Its parameters are opaque to the compiler, so that all materials share one kernel."""
     columns = [dr.opaque(Float, float(c)) + dr.zeros(Float, n) for c in vector(values)]
     return layered_eval.settle(Layered3().gather(columns))
 
@@ -63,7 +63,7 @@ def direction(cos_theta):
 
 
 def random(n, seed):
-    """A stream whose seed is no constant of the kernel either."""
+    """A random stream with an opaque seed, so that all seeds share one kernel."""
     return PCG32(n, dr.opaque(dr.auto.UInt64, seed))
 
 
@@ -72,12 +72,12 @@ def fixed(mu, n):
 
 
 def draw(layers, wi, rng):
-    """A wo of density `layered_eval.pdf`; z < 0 where there is none."""
+    """Draws wo with the density `layered_eval.pdf`. An invalid sample has z < 0."""
     return layered_eval.sample(layers, wi, *(rng.next_float32() for _ in range(3)))
 
 
 def estimates(layers, wi, rng):
-    """(wo, f cos(theta_o) / density) for one wo per lane, drawn by the lobes."""
+    """Draws one wo per lane and returns (wo, f cos(theta_o) / density)."""
     wo = draw(layers, wi, rng)
     pdf = layered_eval.pdf(layers, wi, wo)
     value = layered_eval.evaluate(layers, wi, wo, rng, wo.z > 0)
@@ -86,12 +86,12 @@ def estimates(layers, wi, rng):
 
 
 def limit(comparisons):
-    """The |z| beyond which one of so many two-sided Z-tests rejects."""
+    """The |z| above which one of this many two-sided Z-tests rejects."""
     return norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / comparisons)))
 
 
 def evaluated_table(values, per_row, seed):
-    """Bin averages (theta_i, theta_o, phi, 3) by evaluation, and their standard errors."""
+    """The bin means (theta_i, theta_o, phi, 3) from evaluation, and their standard errors."""
     row = dr.arange(dr.auto.UInt32, GRID.theta_i * per_row) // per_row
     rng = random(dr.width(row), seed)
     layers = layers_of(values, dr.width(row))
@@ -111,19 +111,19 @@ def evaluated_table(values, per_row, seed):
 
 
 def compare(values, seed, factor=1.0):
-    """z of every bin that at least 100 walks reached and of every row's sum, evaluation (times `factor`) over walks."""
+    """The z-scores of evaluation (times `factor`) minus walks, for bins with over 100 walks and for sums of rows."""
     walks = tabulate(Layered3(), vector(values)[None], 1 << 20, stream_keys(seed, range(1)), grid=GRID)
     found, error = evaluated_table(values, 1 << 17, seed)
     enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
     difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2
-    # Bins exclude each other, so adding up their variances overrates that of the sum.
+    # A walk ends in one bin only, so bins are negatively correlated: this sum is an upper bound of the variance.
     rows = difference.sum(axis=(1, 2)) / np.sqrt(variance.sum(axis=(1, 2)))
     return np.concatenate([difference[enough] / np.sqrt(variance[enough]), rows.ravel()])
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_evaluation_equals_walks(case):
-    """In every bin from the mirror direction to grazing; the furthest bins of narrow lobes get no walks to count."""
+    """They agree in every bin that enough walks reach. For narrow lobes, hardly any walk reaches the far bins."""
     z = compare(CASES[case], seed=3)
     assert z.size > 0.2 * GRID.bins
     assert np.abs(z).max() < limit(z.size), f"z {np.abs(z).max():.1f} beyond {limit(z.size):.1f}"
@@ -143,7 +143,10 @@ def test_comparison_would_see_two_percent():
 
 
 def test_integral_of_rough_coat_over_white_conductor():
-    """The case in which two public codes' evaluation and walks disagree: .556 at cos(theta_i) = .9, to three digits."""
+    """The albedo at cos(theta_i) = .9 is .556, to three digits.
+
+    In this case, evaluation and walks of two public programs disagree.
+    """
     n = 1 << 20
     _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), random(n, 5))
     error = weight.std() / np.sqrt(n)
@@ -152,7 +155,7 @@ def test_integral_of_rough_coat_over_white_conductor():
 
 @pytest.mark.parametrize("case", CASES)
 def test_reciprocity(case):
-    """f(wi, wo) = f(wo, wi), in pairs of directions off the mirror."""
+    """f(wi, wo) = f(wo, wi), for pairs of directions away from the mirror direction."""
     n = 1 << 15
     layers = layers_of(CASES[case], n)
     for a, b in ((0.9, 0.8), (0.3, 0.95)):
@@ -165,11 +168,11 @@ def test_reciprocity(case):
 
 
 def test_finite_everywhere():
-    """Random materials over the valid range, corners included, and directions down to the horizon."""
+    """Density and value are finite for random materials of the valid range and for directions near the horizon."""
     n, rng = 1 << 15, np.random.default_rng(2)
 
     def spread(low, high, log=False):
-        """Values over a range, a third of them at its ends."""
+        """Random values in a range. A third of them are at its ends."""
         u = np.clip(rng.uniform(-0.25, 1.25, n), 0.0, 1.0)
         return Float((low * (high / low) ** u if log else low + u * (high - low)).astype(np.float32))
 
@@ -190,7 +193,7 @@ def test_finite_everywhere():
 
 @pytest.mark.parametrize("case", CASES)
 def test_density_follows_the_walk(case):
-    """What walks and lobes draw has density, and estimates weighed by it vary little."""
+    """The density is positive where walks leave, and estimates with directions drawn from it have a low variance."""
     n = 1 << 16
     layers = layers_of(CASES[case], n)
     for mu in (1.0, 0.6, 0.05):
@@ -205,7 +208,7 @@ def test_density_follows_the_walk(case):
 
 
 def test_density_by_quadrature():
-    """A fine grid over the hemisphere; the drawn share of each part of it is its integral."""
+    """In each band of the hemisphere, the share of drawn directions equals the integral of the density."""
     for values in (CASES["white_with_medium"], CASES["thick"], {**CASES["narrow_wide"], "alpha_top": 0.1}):
         for mu in (0.9, 0.3):
             n_z, n_phi = 512, 1024

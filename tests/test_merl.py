@@ -1,4 +1,4 @@
-"""MERL files: their layout, how they are looked up, and how they are written from other sources."""
+"""MERL files: their layout, their evaluation, and how other sources are written as MERL files."""
 
 import math
 import re
@@ -22,21 +22,21 @@ from nma.table import Tables
 
 
 def at(h, d, p):
-    """(light, view) at positions counted in cells."""
+    """The directions (light, view) at a position that is given in cells."""
     theta_h, theta_d = (np.asarray(h) / 90) ** 2 * math.pi / 2, np.asarray(d) / 90 * math.pi / 2
     light, view = half_difference.directions(theta_h, theta_d, np.asarray(p) / 180 * math.pi)
     return light, view
 
 
 def f_of(source, light, view):
-    """f (n, 3), for NumPy directions."""
+    """f (n, 3) of a source, for directions in NumPy."""
     light, view = Vec3(*lanes(*light)), Vec3(*lanes(*view))
     return numbers(source.eval(view, light)) / light.z.numpy()[:, None]
 
 
 @pytest.fixture(scope="module")
 def planes():
-    """Random entries, a tenth of them not measured."""
+    """Planes of random entries, a tenth of which are not measured."""
     rng = np.random.default_rng(0)
     values = rng.random((3, *SHAPE)) + 0.1
     values[:, rng.random(SHAPE) < 0.1] = -1.0
@@ -44,7 +44,7 @@ def planes():
 
 
 def inner_cells(n=2000, seed=1):
-    """Cells whose middles lie above the horizon in both directions."""
+    """Cells in whose middle both directions are above the horizon."""
     rng = np.random.default_rng(seed)
     h, d, p = rng.integers(0, 60, n), rng.integers(0, 40, n), rng.integers(0, 180, n)
     light, view = at(h + 0.5, d + 0.5, p + 0.5)
@@ -90,7 +90,7 @@ def test_a_file_of_full_size_comes_back(planes, tmp_path):
 
 
 def test_the_layout_is_merls(planes, tmp_path):
-    """phi_d runs fastest, then theta_d, then theta_h, then the channels, after three dimensions."""
+    """The file has three dimensions, then the entries. phi_d varies fastest, then theta_d, theta_h and the channel."""
     path = tmp_path / "random.binary"
     Merl(planes).save(path)
     content = path.read_bytes()
@@ -101,16 +101,19 @@ def test_the_layout_is_merls(planes, tmp_path):
 
 
 def test_an_entry_is_the_value_in_the_middle_of_its_cell(planes):
-    """As the database's own reader has it, which truncates angles to numbers of entries; f = number times scale."""
+    """In the middle of a cell, f is the cell's entry times the scale.
+
+    The database's own reader, which rounds angles down to an entry, returns the same.
+    """
     h, d, p = inner_cells()
     expected = (planes[:, h, d, p] * SCALE[:, None]).T
     measured = expected[:, 0] > 0
     source = Merl(planes)
     light, view = at(h + 0.5, d + 0.5, p + 0.5)
-    # The other order has the same entry, by reciprocity.
+    # Swapped directions have the same entry, as the format is reciprocal.
     for found in (f_of(source, light, view), f_of(source, view, light)):
         error = np.abs(found[measured] / expected[measured] - 1.0)
-        # Half vectors close to the normal lose digits in single precision, as their cells are small.
+        # Near the normal, cells are small, so single precision is too coarse for half vectors there.
         assert np.median(error) < 1e-4
         assert error.max() < 0.05
 
@@ -126,7 +129,7 @@ def test_values_between_are_linear_in_each_coordinate():
 
 
 def test_the_azimuth_goes_round():
-    """Between the last and the first entry of phi_d, whose values differ."""
+    """Between the last and the first entry of phi_d, which differ, values are interpolated."""
     plane = np.zeros(SHAPE)
     plane[..., 0], plane[..., -1] = 3.0, 1.0
     found = f_of(
@@ -136,7 +139,7 @@ def test_the_azimuth_goes_round():
 
 
 def test_what_was_not_measured_is_left_out():
-    """A uniform material with holes is uniform; where nothing around was measured it is black."""
+    """A uniform material with missing entries stays uniform. It is black where all neighbours are missing."""
     rng = np.random.default_rng(5)
     uniform = np.where(rng.random(SHAPE) < 0.3, -0.5, 1500.0)
     uniform[40:] = -1.0
@@ -189,7 +192,7 @@ def test_an_anisotropic_source_is_refused():
 
 
 def spoilt(value, where=slice(5, 6)):
-    """A file's content with another value in some entries."""
+    """The content of a file in which some entries are replaced by `value`."""
     entries = np.ones(3 * math.prod(SHAPE))
     entries[where] = value
     return struct.pack("<3i", *SHAPE) + entries.tobytes()
@@ -239,7 +242,7 @@ def test_files_of_other_kinds_are_refused(tmp_path):
 
 
 def test_near_the_mirror_direction_steps_are_fine():
-    """theta_h is spaced by its square root: a lobe half a degree wide is still resolved."""
+    """The grid is uniform in the square root of theta_h, so it resolves a lobe that is half a degree wide."""
     narrow = Formula(lambda wi, wo: wo.z * ops.exp((ops.normalize(wi + wo).z - 1.0) * 2.0e4))
     source = Merl.of(narrow)
     mu = np.full(400, 0.7)
@@ -257,7 +260,7 @@ LACQUER = materials.load("gold-red-lacquer")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A BSDF, an adapter of the class and one of a single material, networks, and a table."""
+    """A folder with a BSDF, an adapter of a class, an adapter of a single material, NBRDF networks and a table."""
     folder = tmp_path_factory.mktemp("sources")
     (folder / "matte.xml").write_text('<bsdf version="3.0.0" type="diffuse"/>')
     (folder / "brushed.xml").write_text(

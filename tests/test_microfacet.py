@@ -1,4 +1,4 @@
-"""Microfacets and Fresnel terms against integrals and closed forms."""
+"""Microfacets and Fresnel terms, compared with integrals and closed forms."""
 
 import numpy as np
 import pytest
@@ -24,9 +24,9 @@ def square(n):
 
 
 def normals(alpha_x, alpha_y, n=400):
-    """Normals whose weighted mean is the integral against D cos(theta), and their weights; dense in the long tail.
+    """Normals and weights such that weighted sums are integrals against D cos(theta). They are dense in the long tail.
 
-    Slopes follow P(|slope / alpha| > t) = 1 / (1 + t^2), here (1 - v)^4.
+    Slopes follow P(|slope / alpha| > t) = 1 / (1 + t^2), which is (1 - v)^4 here.
     """
     v, u2 = square(n)
     t = np.sqrt(1 - (1 - v) ** 4) / (1 - v) ** 2
@@ -48,7 +48,7 @@ ALPHAS = pytest.mark.parametrize("alphas", ((0.001, 0.001), (0.05, 0.3), (0.4, 0
 @ALPHAS
 def test_distribution_is_the_density_of_its_slopes(alphas):
     m, _ = normals(*alphas)
-    # In slopes p = -m.xy / m.z the density D cos^4 is a known one. Heitz 2014, eq. 75 and 84.
+    # In slopes p = -m.xy / m.z, D cos^4 is a known density. Heitz 2014, eq. 75 and 84.
     sx, sy = m.x / m.z / alphas[0], m.y / m.z / alphas[1]
     expected = 1 / (np.pi * alphas[0] * alphas[1] * (1 + sx * sx + sy * sy) ** 2)
     np.testing.assert_allclose(ggx_d(m, *alphas) * m.z**4, expected, rtol=1e-9)
@@ -57,7 +57,7 @@ def test_distribution_is_the_density_of_its_slopes(alphas):
 @ALPHAS
 @pytest.mark.parametrize("cos", (0.1, 0.5, 0.95))
 def test_visible_area_projects_to_the_macrosurface(alphas, cos):
-    # int D(m) G1 <w.m> dm = cos(theta): what Smith masking is made to satisfy. Heitz 2014, eq. 43.
+    # Smith masking is derived from the condition int D(m) G1 <w.m> dm = cos(theta). Heitz 2014, eq. 43.
     m, weight = normals(*alphas)
     w = direction(cos, 0.7)
     g1 = smith_g1(w, *alphas)
@@ -68,7 +68,7 @@ def test_visible_area_projects_to_the_macrosurface(alphas, cos):
 @ALPHAS
 @pytest.mark.parametrize("cos", (0.05, 0.5, 0.95))
 def test_visible_normals_follow_their_density(alphas, cos):
-    # For any function of the normal: the mean over samples is the integral against the density.
+    # For any function of the normal, the mean over samples is the integral against the density.
     w = direction(cos, 0.7)
     m = sample_visible_normal(w, *alphas, *square(600))
     assert np.all(ops.dot(w, m) > -1e-12)
@@ -98,7 +98,7 @@ def test_dielectric_reflectance_in_closed_form():
     s_only = 0.5 * np.sin(2 * brewster - np.pi / 2) ** 2
     assert fresnel_dielectric(np.cos(brewster), 1.5)[0] == pytest.approx(s_only)
     assert fresnel_dielectric(0.0, 1.5)[0] == pytest.approx(1.0)
-    # From the denser side beyond the critical angle everything is reflected.
+    # On the denser side, beyond the critical angle, all light is reflected.
     assert fresnel_dielectric(0.5, 1 / 1.5) == (1.0, 0.0)
 
 

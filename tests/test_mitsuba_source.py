@@ -1,4 +1,4 @@
-"""Mitsuba's BSDFs as sources, and the files of RGL's measured materials among them."""
+"""Mitsuba's BSDFs as sources, including the measured materials of RGL and their files."""
 
 import math
 import shutil
@@ -44,7 +44,7 @@ def bsdf_file(measurements):
 
 
 def write_tensors(path, fields):
-    """A tensor file of the given arrays."""
+    """Writes a tensor file with the given arrays."""
     at = 18 + sum(13 + len(name) + 8 * array.ndim for name, array in fields.items())
     header, data = b"tensor_file\0" + struct.pack("<BBI", 1, 0, len(fields)), b""
     for name, array in fields.items():
@@ -121,7 +121,7 @@ def test_textures_are_looked_up_where_asked():
 
 
 def test_lanes_keep_their_type():
-    """The tables' kind, and Mitsuba's with derivatives."""
+    """Values have the array type of the directions: Dr.Jit's own, or Mitsuba's with derivatives."""
     wi, wo = pairs(10)
     source = from_dict(DIFFUSE)
     there = source.eval(Vec3(*map(mi.Float, wi)), Vec3(*map(mi.Float, wo)))
@@ -171,10 +171,10 @@ def test_variants_that_cannot_serve_are_refused():
 
 
 def nodes(fields, k=0):
-    """(wi, wo, f cos) at a material's own nodes, for its k-th azimuth of incidence.
+    """(wi, wo, f cos) at the nodes of a material's grid, for its k-th azimuth of incidence.
 
-    They lie where a warp by the visible normals takes the points of its grid. Their value is the grid's entry, by the
-    distribution of normals over the projected area. Dupuy and Jakob 2018, section 4.
+    The nodes are the points of the grid, warped by the distribution of visible normals. The value at a node is the
+    grid's entry times the distribution of normals divided by the projected area. Dupuy and Jakob 2018, section 4.
     """
     phi, theta, size = float(fields["phi_i"][k]), fields["theta_i"], fields["rgb"].shape[-1]
     inner = np.arange(1, size - 1)
@@ -198,7 +198,7 @@ def assert_values_of_nodes(source, fields, k=0):
     above = wo.z > 0.05
     assert above.mean() > 0.3
     error = np.abs(numbers(source.eval(Vec3(*lanes(*wi)), Vec3(*lanes(*wo)))) - expected)[above]
-    # Inverting the warp in single precision loses digits where it is steep.
+    # Where the warp is steep, its inversion in single precision loses digits.
     assert np.quantile(error, 0.99) < 1e-3 * expected[above].mean()
 
 
@@ -211,7 +211,7 @@ def test_a_measured_material_has_the_values_of_its_file(measurements, material):
 
 
 def test_a_material_with_azimuths_of_incidence_is_anisotropic(bsdf_file, tmp_path):
-    """A material whose brightness depends on the azimuth, made from an isotropic one."""
+    """The material is an isotropic one whose brightness is changed to depend on the azimuth."""
     fields, azimuths = rgl.read(bsdf_file), np.linspace(-math.pi, math.pi, 5).astype(np.float32)
     tiled = {name: np.repeat(fields[name], 5, axis=0) for name in ("vndf", "luminance", "rgb")}
     tiled["rgb"] = tiled["rgb"] * np.array([1, 2, 3, 4, 1], np.float32)[:, None, None, None, None]
@@ -224,7 +224,7 @@ def test_a_material_with_azimuths_of_incidence_is_anisotropic(bsdf_file, tmp_pat
 
 
 def changed(fields, **others):
-    """The fields with some replaced, or left out where None."""
+    """The fields, with those in `others` replaced. A field that is None in `others` is left out."""
     return {name: array for name, array in (fields | others).items() if array is not None}
 
 
@@ -274,7 +274,7 @@ def test_a_missing_material_is_refused(tmp_path):
 
 
 def assert_refused(path, message):
-    """By every way that leads to the file, in one line that names it."""
+    """Every function that reads the file must raise an error of one line that names the file."""
     nested = {"type": "twosided", "bsdf": {"type": "measured", "filename": str(path)}}
     for load in (lambda: measured(path), lambda: from_dict(nested)):
         with pytest.raises(SourceError, match=message) as caught:

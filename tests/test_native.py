@@ -1,4 +1,4 @@
-"""Compiling the runtime: plugins and library are built once, whole or not at all, and say what is missing."""
+"""Compiling the runtime: plugins and shared library are built once and atomically, and errors say what is missing."""
 
 import numpy as np
 import pytest
@@ -85,7 +85,7 @@ def test_python_reaches_the_batched_kernel(tmp_path):
     again, density = runtime.eval_pdf(materials, wi, wo)
     np.testing.assert_allclose(again[pdf > 0], value[pdf > 0], rtol=1e-6)
     np.testing.assert_allclose(density[pdf > 0], pdf[pdf > 0], rtol=1e-6)
-    # Rows that lie on no boundary of 16 bytes.
+    # These rows are not aligned to 16 bytes.
     shifted = np.empty(materials.size + 1, np.float32)[1:].reshape(materials.shape)
     shifted[:] = materials
     np.testing.assert_array_equal(runtime.eval_pdf(shifted, wi, wo)[0], again)

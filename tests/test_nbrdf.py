@@ -1,4 +1,4 @@
-"""NBRDF networks: the layout of their weights, and how close they come to the measurements that they were fitted to."""
+"""NBRDF networks: the layout of their weights, and their distance to the measurements that they were fitted to."""
 
 import math
 
@@ -13,7 +13,7 @@ from nma.sources import nbrdf, read
 from nma.sources.mitsuba_bsdf import measured
 from nma.sources.nbrdf import Nbrdf
 
-# Log loss of f cos(theta_o) against the measurement, over pairs whose cosines are uniform in .05 .. 1.
+# Log loss of f cos(theta_o) against the measurement, over pairs of directions with cosines uniform in .05 .. 1.
 CLOSENESS = {
     "cc_ibiza_sunset": 0.0037,
     "cg_sunflower": 0.0032,
@@ -33,13 +33,13 @@ def rgl_file(measurements):
 
 
 def rotation(axis, angle):
-    """A matrix that turns vectors about y or z."""
+    """The matrix that rotates vectors about y or z."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]] if axis == "y" else [[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def by_hand(weights, view, light):
-    """f of one pair of directions, in double precision, step by step as the weights' authors describe it."""
+    """f of one pair of directions, in double precision, by the steps that the authors of the networks describe."""
     half = (view + light) / np.linalg.norm(view + light)
     theta_h, phi_h = math.acos(half[2]), math.atan2(half[1], half[0])
     difference = rotation("y", -theta_h) @ rotation("z", -phi_h) @ light
@@ -63,14 +63,14 @@ def test_a_network_is_what_its_authors_describe(merl_file):
 
 @pytest.mark.parametrize("material", CLOSENESS)
 def test_networks_come_close_to_the_measurements_they_were_fitted_to(measurements, rgl_file, material):
-    """Two readers of different files agree, as closely as the networks were trained."""
+    """A network's log loss against the RGL measurement is the one listed for the material."""
     network = Nbrdf.load(rgl_file, f"{material}_rgb")
     source = measured(measurements / "rgl" / f"{material}_rgb.bsdf")
     wi, wo = pairs(200_000, 1, low=0.05)
     reference = numbers(source.eval(wi, wo))
     loss = log_loss(numbers(network.eval(wi, wo)), reference)
     assert loss == pytest.approx(CLOSENESS[material], rel=0.06)
-    # With the difference vector built from the view direction it is further away.
+    # If the difference vector is built from the view direction instead, the loss is larger.
     swapped = numbers(network.eval(wo, wi)) * (wo.z / wi.z).numpy()[:, None]
     assert log_loss(swapped, reference) > 1.2 * loss
 

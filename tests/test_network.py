@@ -1,4 +1,4 @@
-"""Networks, encodings, and the numbers that adapters make of both: the same on all libraries, within their ranges."""
+"""Networks, encodings and adapters' numbers: they agree in all array packages and stay within their ranges."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from nma.target import PRINCIPLED_PARAMS
 
 
 def test_the_paper_s_network_has_7159_parameters():
-    """A library of 100 learnt embeddings of 32 numbers; 33 inputs (with cos theta_i) to 3x32 to 23 outputs."""
+    """The paper's network: 100 learnt embeddings of 32 numbers, 33 inputs (with cos theta_i), 3x32, 23 outputs."""
     assert target.output_size(2) == 23
     layers = network.init(np.random.default_rng(0), [33, *network.hidden("3x32"), target.output_size(2)])
     assert network.parameters(layers) + 100 * 32 == 7159
@@ -31,7 +31,7 @@ def test_networks_are_named_by_depth_and_width():
 
 @pytest.mark.parametrize("blocks", (False, True))
 def test_a_network_is_its_matrices(blocks, monkeypatch):
-    """Against the sum written out: ReLU between the layers, none after the last. A layer has more than one block."""
+    """The outputs equal matrix products with ReLU between the layers. One layer is larger than a block."""
     monkeypatch.setattr(network, "_many_registers", lambda value: blocks)
     rng = np.random.default_rng(3)
     layers = [
@@ -55,7 +55,7 @@ def test_a_network_is_its_matrices(blocks, monkeypatch):
 
 
 def test_initial_layers_have_the_spread_of_their_law():
-    """He 2015: outputs as large as inputs; the output's bias as asked for; the same seed, the same layers."""
+    """He 2015: outputs are about as large as inputs. The output bias is as given. Equal seeds give equal layers."""
     layers = network.init(np.random.default_rng(0), [200, 300, 100], np.arange(100))
     assert layers[0][0].std() == pytest.approx(np.sqrt(2.0 / 200), rel=0.02)
     assert layers[1][0].std() == pytest.approx(0.1 * np.sqrt(2.0 / 300), rel=0.02)
@@ -89,7 +89,7 @@ def test_the_raw_encoding_is_the_paper_s_input():
 
 
 def test_encodings_agree_on_all_libraries():
-    """The same numbers from plain floats, NumPy and Dr.Jit."""
+    """Plain floats, NumPy and Dr.Jit give the same numbers."""
     params, mu = materials(50), np.linspace(0.0, 1.0, 50)
     on_numpy = np.stack(np.broadcast_arrays(*encoding.layered3(list(params.T), at_azimuth_0(mu))), axis=-1)
     columns = [dr.auto.Float(c.astype(np.float32)) for c in params.T]
@@ -107,7 +107,7 @@ def test_an_unknown_encoding_is_refused():
 
 
 def flat(brdf):
-    """The numbers of its blend as an array (lanes, size)."""
+    """The numbers of the BRDF's blend, as an array (lanes, size)."""
     numbers = target.numbers(brdf.blend)
     dr.eval(numbers)
     lanes = [np.asarray(x.numpy() if dr.is_array_v(x) else x, np.float64) for x in numbers]
@@ -137,13 +137,13 @@ def test_only_directional_adapters_depend_on_the_direction(form, name):
     varies = np.ptp(curves, axis=1).max() > 1e-3
     assert varies == adapter.directional
     if not adapter.directional:
-        # Rounding alone: a product of matrices may sum the last rows in another order than the first.
+        # Only rounding may differ: a matrix product may sum the last rows in another order than the first.
         assert np.ptp(curves, axis=1).max() < 1e-6
     assert (np.ptp(curves, axis=0).max() > 1e-3) == (name != "direction")
 
 
 def test_curves_are_the_prepared_numbers():
-    """`numbers` for each material and cosine is what `prepare` says there."""
+    """`Adapter.numbers` gives for each material and cosine the same numbers as `prepare`."""
     adapter, params, mu = random_adapter(), materials(3), np.array([0.0, 0.4, 1.0])
     curves = adapter.numbers(params, mu)
     for m in range(3):
@@ -154,7 +154,7 @@ def test_curves_are_the_prepared_numbers():
 
 
 def test_decoded_numbers_lie_in_their_ranges():
-    """However wild the network."""
+    """Decoding keeps the numbers within their ranges even if the network's outputs are huge."""
     wild = random_adapter()
     wild = replace(wild, layers=[(100.0 * m, 100.0 * b) for m, b in wild.layers])
     curves = wild.numbers(materials(50), np.linspace(0.0, 1.0, 5))

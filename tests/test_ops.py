@@ -1,4 +1,4 @@
-"""The operations give the same numbers in every array library."""
+"""The operations of `nma.ops` give the same numbers in every array package."""
 
 import math
 

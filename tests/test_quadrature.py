@@ -1,7 +1,8 @@
 """Points inside the bins of a table: weighted means of known functions, and of lobes far narrower than a bin.
 
-Estimates are repeated with independent random shifts of their lattice; Student's t-tests compare their mean with the
-known value. Each test shares the false-alarm rate `FALSE_ALARM` among its comparisons (Sidak); seeds are fixed.
+An estimate is repeated with independent random shifts of its lattice. Student's t-test compares the mean of the
+estimates with the known value. A test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's
+correction. All seeds are fixed.
 """
 
 import math
@@ -20,7 +21,8 @@ FALSE_ALARM = 1e-3
 REPEATS = 16
 LAST = 39
 
-# Bins (theta_i, theta_o, phi) of every kind: grazing, normal incidence, mirror direction and its neighbours, far away.
+# Bins (theta_i, theta_o, phi) of every kind: at grazing and normal incidence, at the mirror direction, beside it, and
+# far from it.
 BINS = np.array(
     [
         (0, 0, 0),
@@ -44,14 +46,14 @@ BINS = np.array(
 
 
 def shifted(n, shape, seed):
-    """The lattice of n points (3, n, *shape), shifted at random for each entry."""
+    """Lattices of n points (3, n, *shape), each shifted at random."""
     shift = np.random.default_rng(seed).random((3, 1, *shape))
     lattice = quadrature.lattice(n).T.reshape(3, n, *(1,) * len(shape))
     return (lattice + shift) % 1.0
 
 
 def crowded(bins, n, seed, repeats=REPEATS):
-    """Points (n, repeats, bins) of `bin_points`."""
+    """Points (n, repeats, bins) from `bin_points`."""
     i, o, p = bins.T
     return quadrature.bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
 
@@ -62,9 +64,9 @@ def uniform(bins, n, seed, repeats=REPEATS):
 
 
 def assert_means(estimates, expected):
-    """t-tests of the mean over axis 0, the repetitions, of `estimates` (repeats, ...) against `expected` (...)."""
+    """t-tests that compare the means of `estimates` (repeats, ...) over the repetitions with `expected` (...)."""
     mean, spread = estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / math.sqrt(len(estimates))
-    # Below this the rounding of single numbers shows.
+    # A smaller standard error would be dominated by rounding.
     t = np.abs(mean - expected) / np.maximum(spread, 1e-7 * np.abs(expected) + 1e-12)
     limit = stats.t.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / t.size)), len(estimates) - 1)
     worst = np.unravel_index(np.argmax(t), t.shape)
@@ -74,13 +76,13 @@ def assert_means(estimates, expected):
 
 
 def azimuth_away(points):
-    """How far wo lies from the azimuth of the mirror direction, 0 .. pi."""
+    """The azimuth between wo and the mirror direction, 0 .. pi."""
     return np.abs(np.arctan2(points.wo.y, -points.wo.x))
 
 
 @pytest.mark.parametrize("law", (crowded, uniform))
 def test_means_of_smooth_functions_are_exact(law):
-    """Moments of both cosines, of their product and of the azimuth: the weights have mean 1 and no preference."""
+    """The weights have mean 1, and weighted moments of cosines and azimuth are those of uniform points."""
     points = law(BINS, 2048, 1)
     i, o, p = BINS.T
     width, step = 1.0 / 40, math.pi / 40
@@ -106,12 +108,12 @@ def test_means_of_smooth_functions_are_exact(law):
     "law", (quadrature.bin_points, quadrature.uniform_bin_points), ids=("crowded", "uniform")
 )
 def test_points_lie_in_their_bins(law, dtype):
-    """All 64,000 bins, at random points and at the ends of the unit cube."""
+    """In all 64,000 bins, random points and the corners of the unit cube stay inside."""
     i, o, p = (x.ravel().astype(dtype) for x in np.meshgrid(*[np.arange(40)] * 3, indexing="ij"))
     rng = np.random.default_rng(3)
     below_one = np.nextafter(dtype(1), dtype(0))
     corners = [np.full((3, len(i)), u, dtype) for u in (0.0, below_one)]
-    # Cosines are kept 1e-6 away from the horizon, which may push the other direction's beyond its bin by as much.
+    # Points keep cosines 1e-6 above the horizon. This may move the other direction's cosine out of its bin by as much.
     slack = 1e-6 + 4 * np.finfo(dtype).eps
     for u in (*corners, rng.random((3, len(i)), dtype), rng.integers(0, 2, (3, len(i))) * below_one):
         points = law(i, o, p, tuple(u.astype(dtype)))
@@ -126,7 +128,7 @@ def assert_in_bins(points, i, o, p, slack):
         assert (mu <= (k + 1) / 40 + slack).all()
         assert mu.min() > 0
         assert mu.max() <= 1
-    # wi lies at azimuth 0; on the vertical, azimuths mean nothing.
+    # wi lies at azimuth 0. A vertical wo has no azimuth.
     assert (points.wi.y == 0).all()
     away = azimuth_away(points)
     clear = points.wo.z < 1.0 - 1e-5
@@ -147,7 +149,7 @@ def lobe(wi, wo, alpha):
 
 @pytest.mark.parametrize("name", ("numpy", "drjit"))
 def test_single_precision_is_enough_for_the_narrowest_lobe(name):
-    """In all bins near the mirror direction, half vectors keep enough digits to evaluate a lobe of alpha .001."""
+    """In all bins near the mirror direction, half vectors are precise enough to evaluate a lobe of alpha .001."""
     i, o, p = (x.ravel() for x in np.meshgrid(np.arange(40.0), [-1, 0, 1], [38.0, 39.0], indexing="ij"))
     o = np.clip(i + o, 0, 39)
     u = np.random.default_rng(5).random((3, 50, len(i)), np.float32).astype(np.float64)
@@ -165,15 +167,15 @@ def test_single_precision_is_enough_for_the_narrowest_lobe(name):
 
 
 def graded(n):
-    """Nodes and weights on 0 .. 1 that crowd towards both ends."""
+    """Nodes and weights of a quadrature on 0 .. 1 whose nodes get denser towards both ends."""
     x, w = np.polynomial.legendre.leggauss(n)
     t = 0.5 * (x + 1.0)
-    # The regularised incomplete beta function B(4, 4), smooth and flat at both ends.
+    # Substitute the regularised incomplete beta function B(4, 4), which is smooth, and flat at both ends.
     return t**4 * (35 - 84 * t + 70 * t**2 - 20 * t**3), 0.5 * w * 140 * t**3 * (1 - t) ** 3
 
 
 def peaked(low, high, scale, n):
-    """Nodes and weights on low .. high that crowd around 0: x = scale sinh t."""
+    """Nodes and weights of a quadrature on low .. high whose nodes get denser around 0: x = scale sinh t."""
     x, w = np.polynomial.legendre.leggauss(n)
     start, stop = np.arcsinh(low / scale), np.arcsinh(high / scale)
     t = start + 0.5 * (x + 1.0) * (stop - start)
@@ -181,7 +183,7 @@ def peaked(low, high, scale, n):
 
 
 def mean_at(mu_i, o, p, alpha, n):
-    """Mean of the lobe over the bin (o, p) of wo for one wi, by quadrature."""
+    """The mean of the lobe over the bin (o, p) of wo, for one wi, by quadrature."""
     sin_i = math.sqrt(1.0 - mu_i * mu_i)
     s, ws = peaked(o / 40 - mu_i, (o + 1) / 40 - mu_i, 2 * alpha * sin_i, n)
     psi, wp = peaked((39 - p) * math.pi / 40, (40 - p) * math.pi / 40, 2 * alpha * mu_i / sin_i, n)
@@ -193,7 +195,7 @@ def mean_at(mu_i, o, p, alpha, n):
 
 
 def mean_of_bin(i, o, p, alpha, nodes=80, n=48):
-    """Mean of the lobe over the whole bin, by brute force."""
+    """The mean of the lobe over the bin (i, o, p), by brute-force quadrature."""
     t, w = graded(nodes)
     return sum(wk * mean_at((i + tk) / 40, o, p, alpha, n) for tk, wk in zip(t, w, strict=True))
 
@@ -203,12 +205,12 @@ LOBE_BINS = ((20, 20, 39), (20, 21, 39), (20, 20, 38), (4, 4, 39), (35, 34, 39))
 
 @pytest.fixture(scope="module")
 def lobe_means():
-    """Means of a lobe of alpha .001 over `LOBE_BINS`, from 184,320 nodes each."""
+    """The means of a lobe of alpha .001 over the bins `LOBE_BINS`, from 184,320 nodes each."""
     return np.array([mean_of_bin(*bin, 0.001) for bin in LOBE_BINS])
 
 
 def test_the_quadrature_has_converged(lobe_means):
-    """With half as many nodes again in every dimension it agrees to a thousandth."""
+    """With 1.5 times as many nodes in every dimension, the quadrature gives the same mean to one part in a thousand."""
     assert mean_of_bin(*LOBE_BINS[0], 0.001, 120, 72) == pytest.approx(lobe_means[0], rel=1e-3)
 
 
@@ -216,12 +218,12 @@ def test_means_of_a_lobe_of_alpha_001_are_exact(lobe_means):
     points = crowded(np.array(LOBE_BINS, np.float64), 1 << 13, 6)
     estimates = (points.weight * lobe(points.wi, points.wo, 0.001)).mean(axis=0)
     assert_means(estimates / lobe_means, 1.0)
-    # And precise enough for that to mean something.
+    # The estimates must also be precise, or the test above would prove nothing.
     assert (estimates.std(axis=0, ddof=1) / math.sqrt(REPEATS) < 0.01 * lobe_means).all()
 
 
 def test_a_few_crowded_points_see_what_uniform_points_miss(lobe_means):
-    """The standard deviation of an estimate from 20 points of the mirror bin's mean, in terms of the mean."""
+    """For the mean of the mirror bin from 20 points, uniform points have a far larger standard deviation."""
     mirror = np.array(LOBE_BINS[:1], np.float64)
     spread = []
     for law in (crowded, uniform):
@@ -249,7 +251,7 @@ def test_other_grids_work_too():
 
 
 def test_lattice_points_are_well_spread():
-    """Every one of 512 cells of the cube holds about its share of 4096 points."""
+    """Each of 512 cells of the cube has about an equal share of 4096 points."""
     points = quadrature.lattice(4096)
     assert points.shape == (4096, 3)
     cells = np.bincount((points * 8).astype(int) @ [64, 8, 1], minlength=512)

@@ -1,4 +1,4 @@
-"""What holds for every source that knows its values: near the horizon, and where a file is not there."""
+"""Rules for every source that can be evaluated: values near the horizon, and the error for a missing file."""
 
 import math
 
@@ -28,7 +28,10 @@ COSINES = (0.0, 1e-30, 1e-12, 1e-8, 1e-7, 1e-5, 1e-3)
 
 
 def grazing(cosines, n=500):
-    """Pairs of directions, either at these cosines or both, all round: on the same side, on opposite ones, neither."""
+    """Pairs in which one direction or both have one of the `cosines`.
+
+    Their azimuths are equal, opposite, or 1 rad apart.
+    """
     rng, pairs = np.random.default_rng(0), []
     for cosine in cosines:
         for one, other in ((cosine, cosine), (cosine, 0.5), (0.5, cosine)):
@@ -55,7 +58,7 @@ def test_values_at_the_horizon_are_finite(name):
 
 @pytest.mark.parametrize("name", ("paper_white", "cg_sunflower"))
 def test_measured_values_at_the_horizon_are_finite(measurements, name):
-    """No brighter than a little above it, where the whole of a forward peak is seen."""
+    """At the horizon, values are not larger than a little above it, where the whole forward peak is visible."""
     source = sources.read(measurements / "rgl" / f"{name}_rgb.bsdf")
     peak = numbers(source.eval(*grazing((1e-4, 1e-3, 1e-2)))).max()
     assert_finite(source, 1.1 * peak)

@@ -1,6 +1,7 @@
-"""Tables of walks against sources whose f is known, and their files.
+"""Tables from random walks, compared with sources whose f is known, and the files of tables.
 
-Statistical tests share the false-alarm rate `FALSE_ALARM` among their comparisons (Sidak); seeds are fixed.
+A statistical test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's correction. All
+seeds are fixed.
 """
 
 import math
@@ -31,7 +32,7 @@ ROUGH = {
 
 
 class Scatter:
-    """A source of one event: draws wo, and gives it a throughput that its subclass knows."""
+    """A source with a single event. The method `draw` of a subclass returns wo and a factor of the throughput."""
 
     space = ParamSpace("scatter", (Param("rho", "rho", "uniform", 0.0, 1.0, 0.0, 1.0, "its colour", 3),))
 
@@ -46,7 +47,7 @@ class Scatter:
 
 
 class Lambert(Scatter):
-    """f = rho / pi, sampled by its cosine."""
+    """f = rho / pi, with wo drawn in proportion to cos(theta_o)."""
 
     def draw(self, wi, u1, u2):
         phi, r = 2.0 * math.pi * u1, ops.safe_sqrt(u2)
@@ -54,7 +55,7 @@ class Lambert(Scatter):
 
 
 class Lopsided(Scatter):
-    """f cos(theta_o) = rho mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi), with wo uniform."""
+    """f cos(theta_o) = rho mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi), with wo drawn uniformly."""
 
     def draw(self, wi, u1, u2):
         phi, r = 2.0 * math.pi * u1, ops.safe_sqrt(1.0 - u2 * u2)
@@ -64,7 +65,7 @@ class Lopsided(Scatter):
 
 
 class Retro(Scatter):
-    """f cos(theta_o) = rho mu_i (1 + cos(phi_o - phi_i)) / (4 pi): light goes back to where it came from."""
+    """f cos(theta_o) = rho mu_i (1 + cos(phi_o - phi_i)) / (4 pi): a retro-reflector."""
 
     def draw(self, wi, u1, u2):
         phi, r = 2.0 * math.pi * u1, ops.safe_sqrt(1.0 - u2 * u2)
@@ -78,7 +79,7 @@ def middles(n):
 
 
 def assert_table(tables, expected):
-    """Z-test of every bin with the table's own standard error, and a chi-square over the bins."""
+    """A Z-test of every bin with the table's own standard error, and a chi-square test over all bins."""
     z = (tables.values[..., 0].astype(np.float64) - expected) / tables.error[..., 0]
     limit = norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / z.size)))
     assert np.abs(z).max() < limit
@@ -92,7 +93,7 @@ def scatter_tables(source, grid, walks=1 << 21, rho=(0.8, 0.4, 0.0)):
 
 
 def test_bins_of_a_lambertian_surface_are_normalised():
-    """Eq. 9: the mean of rho / pi cos(theta_o) over each bin."""
+    """Every bin has the mean of rho / pi cos(theta_o) over the bin (paper eq. 9)."""
     tables = scatter_tables(Lambert(), SMALL)
     expected = np.broadcast_to((0.8 / math.pi * middles(5))[:, None], (1, 4, 5, 6))
     assert_table(tables, expected)
@@ -102,7 +103,7 @@ def test_bins_of_a_lambertian_surface_are_normalised():
 
 
 def test_bins_know_theta_i_and_azimuth():
-    """phi is the azimuth from wi, folded: the first bin is retro-reflection, the last the mirror direction."""
+    """phi is the folded azimuth between wi and wo: the first bin is retro-reflection, the last the mirror direction."""
     edges = np.linspace(0.0, math.pi, 7)
     azimuth = 1.0 + np.diff(np.sin(edges)) / np.diff(edges)
     expected = 0.8 / (4.0 * math.pi) * middles(4)[:, None, None] * azimuth
@@ -110,7 +111,7 @@ def test_bins_know_theta_i_and_azimuth():
 
 
 def test_bins_of_an_anisotropic_table():
-    """Bins of all four angles, azimuths over the whole circle."""
+    """The table has bins in all four angles. Azimuths cover the whole circle."""
     grid = Grid(3, 4, 6, phi_i=5)
     edges_i, edges_o = np.linspace(0.0, 2.0 * math.pi, 6), np.linspace(0.0, 2.0 * math.pi, 7)
     phi_i = 2.0 + np.diff(np.sin(edges_i)) / np.diff(edges_i)
@@ -132,14 +133,14 @@ def test_albedo_is_what_all_bins_reflect():
 
 
 def test_standard_errors_are_the_spread_of_independent_tables():
-    """Over 60 seeds, the variance of each bin over its mean stated variance averages to one."""
+    """The variance of a bin over 60 seeds equals, on average over the bins, the variance that the tables state."""
     grid, seeds = Grid(5, 5, 5), 60
     params = np.tile(LAYERED3.vector(ROUGH), (seeds, 1))
     tables = tabulate(sources.get("layered3"), params, 50_000, stream_keys(11, range(seeds)), grid=grid)
     values, errors = tables.values.astype(np.float64), tables.error.astype(np.float64)
     assert (values > 0).all()
     ratio = values.var(axis=0, ddof=1) / np.mean(errors**2, axis=0)
-    # Channels share their walks: one of them at a time.
+    # The channels of a walk are correlated, so test one channel at a time.
     for channel in range(3):
         statistic = (seeds - 1) * ratio[..., channel].sum()
         freedom = (seeds - 1) * ratio[..., channel].size
@@ -147,13 +148,16 @@ def test_standard_errors_are_the_spread_of_independent_tables():
 
 
 def test_the_folded_table_equals_the_folded_anisotropic_one():
-    """Bins of wi and wo in the full table leave their azimuth's difference a triangular law; apply it to the other."""
+    """A pair of azimuth bins of the full table covers a range of differences, with a triangular density.
+
+    The folded table, averaged with this density, must give the value of the pair.
+    """
     steps, fine = 8, 8
     params, source = LAYERED3.vector(ROUGH)[None], sources.get("layered3")
     full = tabulate(source, params, 1 << 20, stream_keys(1, [0]), grid=Grid(3, 3, steps, phi_i=steps))
     folded = tabulate(source, params, 1 << 21, stream_keys(2, [0]), grid=Grid(3, 3, steps * fine // 2))
 
-    # Difference d of the azimuths' bins, then its mirror image: (theta_i, theta_o, d).
+    # The full table by the difference d of the two azimuth bins, averaged over wi: (theta_i, theta_o, d).
     shifted = [np.roll(full.values[0][:, a], -a, axis=2) for a in range(steps)]
     by_difference = np.mean(shifted, axis=0)[..., 0].astype(np.float64)
     variance = (
@@ -161,7 +165,7 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         / steps**2
     )
 
-    # The folded table over the whole circle, weighted by the triangle of each difference.
+    # The folded table, unfolded to the whole circle. Then average it with the triangle around each difference.
     circle = np.concatenate([folded.values[0, ..., 0], folded.values[0, ..., ::-1, 0]], axis=2)
     noise = np.concatenate([folded.error[0, ..., 0], folded.error[0, ..., ::-1, 0]], axis=2)
     expected, expected_variance = np.empty_like(by_difference), np.empty_like(by_difference)
@@ -171,7 +175,7 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         weights = np.maximum(1.0 - away, 0.0)
         weights /= weights.sum()
         expected[..., d] = circle @ weights
-        # Mirror halves of the circle are the same bins: their errors add up before they are squared.
+        # Both halves of the circle are the same bins, so add their errors before squaring.
         halves = weights[: steps * fine // 2] + weights[steps * fine // 2 :][::-1]
         expected_variance[..., d] = noise[..., : steps * fine // 2] ** 2 @ halves**2
     z = np.abs(by_difference - expected) / np.sqrt(variance + expected_variance)
@@ -179,7 +183,7 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
 
 
 def test_a_table_depends_on_its_own_key_alone(monkeypatch):
-    """Neither company, nor order, nor the launches that the work is split into."""
+    """Other materials in the call, their order, and the division into launches do not change a table."""
     source, count = sources.get("layered3"), 40 * 1000
     params = LAYERED3.sample(np.random.default_rng(4), 5)
     keys = stream_keys(9, range(5))
@@ -207,7 +211,7 @@ def test_launches_of_an_anisotropic_table_continue_each_other(monkeypatch):
 
 
 def test_no_bin_overflows():
-    """All walks of a row in one bin, each with throughput 1, more of them than one launch may count."""
+    """All walks of a row end in one bin with throughput 1. There are more of them than one launch may count."""
 
     class Up(Scatter):
         def draw(self, wi, u1, u2):
@@ -241,7 +245,7 @@ def test_stream_keys_depend_on_seed_and_index():
 
 
 def test_no_more_memory_than_stated():
-    """The launch of many materials counts in a bounded number of bins."""
+    """A call with many materials is divided into launches with a limited number of bins."""
     assert walks._BINS_PER_LAUNCH * 3 * 2 * (4 + 8) <= 2**28
 
 
@@ -266,7 +270,7 @@ def test_saved_tables_come_back(tables, tmp_path):
 
 
 def test_one_number_of_walks_and_half_precision_are_enough(tables, tmp_path):
-    """The reference-file format of CONVENTIONS.md, as others may write it."""
+    """These variants of the reference-file format (CONVENTIONS.md) are valid; other programs may write them."""
     path = tmp_path / "theirs.npz"
     np.savez(path, params=tables.params, table=tables.values.astype(np.float16), walks=819_200)
     back = Tables.load(path)

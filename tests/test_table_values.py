@@ -1,4 +1,4 @@
-"""Tables of sources that know their value, against closed forms and quadratures, and tables as such sources."""
+"""Tables of sources that can be evaluated, compared with closed forms and quadratures, and tables as such sources."""
 
 import math
 
@@ -32,7 +32,7 @@ def middles(n):
 
 
 def ggx(alpha):
-    """A rough conductor that absorbs nothing."""
+    """Mitsuba's rough conductor without absorption."""
     return from_dict({"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": alpha})
 
 
@@ -55,7 +55,10 @@ def test_bins_of_a_lambertian_surface_hold_their_means(grid):
 
 
 def assert_close(tables, expected, grid):
-    """Where points are spread evenly, means of linear functions are as good as exact; where they crowd, as stated."""
+    """Compares a table of a linear function with its means.
+
+    Bins with even points must be almost exact. Bins near the mirror direction must be within their stated errors.
+    """
     near = values._near_mirror(np.arange(grid.bins), grid).reshape(grid.shape[:-1])
     found, error = tables.values[0], tables.error[0]
     np.testing.assert_allclose(found[~near], expected[~near], rtol=2e-4)
@@ -63,14 +66,14 @@ def assert_close(tables, expected, grid):
 
 
 def assert_as_stated(found, expected, error):
-    """Deviations have the stated variance, or less, and are small."""
+    """The deviations are small, and their variance is about the stated one or less."""
     deviation = (found - expected).astype(np.float64)
     assert np.sum(deviation**2) < 2.0 * np.sum(error.astype(np.float64) ** 2)
     assert np.abs(deviation).sum() < 0.015 * expected.sum()
 
 
 def test_bins_know_theta_i_and_azimuth():
-    """phi is the azimuth from wi, folded: the first bin is retro-reflection, the last the mirror direction."""
+    """phi is the folded azimuth between wi and wo: the first bin is retro-reflection, the last the mirror direction."""
 
     def retro(wi, wo):
         sines = ops.maximum(ops.safe_sqrt(1.0 - wi.z * wi.z) * ops.safe_sqrt(1.0 - wo.z * wo.z), 1e-6)
@@ -84,7 +87,7 @@ def test_bins_know_theta_i_and_azimuth():
 
 
 def test_bins_of_an_anisotropic_table():
-    """Bins of all four angles, azimuths over the whole circle."""
+    """The table has bins in all four angles. Azimuths cover the whole circle."""
     edges_i, edges_o = np.linspace(0.0, 2.0 * math.pi, 6), np.linspace(0.0, 2.0 * math.pi, 7)
     phi_i = 2.0 + np.diff(np.sin(edges_i)) / np.diff(edges_i)
     phi_o = 2.0 - np.diff(np.cos(edges_o)) / np.diff(edges_o)
@@ -94,7 +97,7 @@ def test_bins_of_an_anisotropic_table():
 
 
 def test_a_folded_bin_is_the_mean_of_both_mirror_halves():
-    """An isotropic material may be handed: turning left is not turning right."""
+    """An isotropic material may have different values for a pair of directions and its mirror image."""
     handed = Formula(
         lambda wi, wo: Color.of(wo.z * (1.0 + 0.9 * ops.select(wi.x * wo.y > wi.y * wo.x, 1.0, -1.0)))
     )
@@ -104,35 +107,38 @@ def test_a_folded_bin_is_the_mean_of_both_mirror_halves():
 
 @pytest.mark.parametrize("alpha", (0.001, 0.1))
 def test_peaks_of_a_rough_conductor_are_those_of_the_quadrature(alpha):
-    """From lobes thirty times narrower than a bin to wide ones: the renderer's value, our points, brute force."""
+    """Mitsuba's conductor, averaged over our points, equals brute-force quadrature, for a narrow and a wide lobe.
+
+    The narrow lobe is thirty times narrower than a bin.
+    """
     tables = tabulate_values(ggx(alpha), points=64)
     expected = np.array([mean_of_bin(*bin, alpha) for bin in LOBE_BINS])
     found = np.array([tables.values[0][bin][0] for bin in LOBE_BINS])
     np.testing.assert_allclose(found, expected, rtol=0.03)
     error = np.array([tables.error[0][bin][0] for bin in LOBE_BINS])
-    # Student's t with three degrees of freedom: beyond 13 once in a thousand.
+    # Student's t with three degrees of freedom exceeds 13 once in a thousand cases.
     assert (np.abs(found - expected) < 13 * error + 2e-3 * expected).all()
 
 
 def test_a_narrow_lobe_of_an_anisotropic_table_folds_to_the_isotropic_one():
-    """Means over all azimuths of wi and wo, at equal elevations, are the same."""
+    """For each pair of elevations, both tables have the same mean over all azimuths."""
     full = tabulate_values(ggx(0.01), grid=Grid(6, 6, 12, phi_i=12)).values[0, ..., 0]
     folded = tabulate_values(ggx(0.01), grid=Grid(6, 6, 12)).values[0, ..., 0]
     np.testing.assert_allclose(full.mean(axis=(1, 3)), folded.mean(axis=-1), rtol=0.02)
-    # Every azimuth of wi is like another.
+    # The table is the same for every azimuth of wi, as the material is isotropic.
     shifted = np.array([np.roll(full[:, a], -a, axis=-1) for a in range(12)])
     assert np.mean(shifted.std(axis=0)) < 0.02 * np.mean(shifted)
 
 
 def test_stated_errors_are_the_spread_of_the_means():
-    """Squared deviations from a table of 16 times the points, over the stated variance."""
+    """Squared deviations from a table with 16 times the points are about as large as the stated variance."""
     source = ggx(0.2)
     tables, better = (tabulate_values(source, grid=Grid(10, 10, 10), points=n) for n in (64, 1024))
     deviation = (tables.values - better.values).astype(np.float64)[..., 0]
     stated = tables.error.astype(np.float64)[..., 0]
     assert 0.5 < np.sum(deviation**2) / np.sum(stated**2) < 2.0
     assert 0.5 < np.median(np.abs(deviation)) / np.median(stated) < 1.2
-    # As many walks would leave half of the bins with at least the error stated.
+    # With `walks` random walks, about half of the bins would have a larger error than the stated one.
     counting = metrics.counting_error(
         tables.values[0], int(tables.walks[0]), Grid(10, 10, 10).solid_angle, 10
     )
@@ -189,7 +195,7 @@ def test_a_table_as_a_source_gives_the_table_again(grid):
 
 
 def test_a_table_as_a_source_knows_its_bins():
-    """Edges, the azimuth's sign, and directions turned together."""
+    """A pair of directions gets the value of its bin, whatever the azimuth of wi and the sign of the difference."""
     tables = random_tables(SMALL)
     wi, wo = pairs(2000)
     found = numbers(TableValues(tables).eval(wi, wo))
@@ -208,7 +214,7 @@ def test_a_table_as_a_source_knows_its_bins():
     "grid", (Grid(20, 20, 20), Grid(12, 12, 24, phi_i=24)), ids=("isotropic", "anisotropic")
 )
 def test_a_smooth_table_has_no_steps(grid):
-    """It reproduces a function that is linear in the cosines, between the middles of the outermost bins."""
+    """It reproduces a function that is linear in the cosines, except in the outer halves of the outermost bins."""
     tables = tabulate_values(Formula(lambda wi, wo: Color.of(wi.z * 0.5 + wo.z)), grid=grid)
     rough, smooth = TableValues(tables), TableValues(tables, smooth=True)
     wi, wo = pairs(5000)
@@ -220,7 +226,7 @@ def test_a_smooth_table_has_no_steps(grid):
 
 @pytest.mark.parametrize("smooth", (False, True))
 def test_lanes_with_derivatives_look_up_the_same_numbers(smooth):
-    """Mitsuba's lanes, as a BSDF gets them."""
+    """A table can be evaluated with Mitsuba's own array types, as inside a BSDF."""
     source = TableValues(random_tables(SMALL), smooth=smooth)
     wi, wo = pairs(100)
     there = source.eval(Vec3(*map(mi.Float, wi)), Vec3(*map(mi.Float, wo)))
@@ -235,14 +241,15 @@ def test_a_material_that_a_table_does_not_have_is_refused():
 
 @pytest.mark.slow
 def test_a_material_survives_a_merl_file():
-    """From the renderer through MERL's resolution to a table."""
+    """A BSDF of the renderer, sampled at MERL's resolution, gives almost the same table as the BSDF itself."""
     direct, through = (tabulate_values(source, points=64) for source in (ggx(0.1), Merl.of(ggx(0.1))))
     figures = metrics.table_metrics(through.values[0], direct.values[0], direct.error[0])
     assert figures["log_loss"] < 3e-4
     assert figures["albedo_error"] < 5e-3
 
 
-# Bins (theta_i, phi_i, theta_o, phi_o) of an anisotropic grid: mirror direction, beside it, far off, at the seam.
+# Bins (theta_i, phi_i, theta_o, phi_o) of an anisotropic grid: at the mirror direction, beside it, far from it, and
+# where the azimuth wraps around.
 FOUR = np.array(
     [(3, 2, 3, 8), (3, 2, 3, 7), (0, 11, 1, 5), (5, 0, 5, 6), (5, 0, 0, 0), (2, 11, 4, 0)], np.float64
 )
@@ -250,7 +257,7 @@ FOUR = np.array(
 
 @pytest.mark.parametrize("crowded", (True, False))
 def test_points_of_anisotropic_bins_have_no_preference(crowded):
-    """Moments of all four angles: weights have mean 1, and the azimuths go round the right way."""
+    """The weights have mean 1, and weighted moments of all four angles are those of uniform points."""
     grid = Grid(6, 8, 12, phi_i=10)
     bins = np.minimum(FOUR, [5, 9, 7, 11])
     i, a, o, b = bins.T
@@ -274,7 +281,7 @@ def test_points_of_anisotropic_bins_have_no_preference(crowded):
 
 
 def test_crowded_points_of_anisotropic_bins_have_the_mean_of_even_ones():
-    """The mean of a lobe of alpha .05 over two mirror bins, against many more even points."""
+    """The mean of a lobe of alpha .05 over two mirror bins agrees with that of many more uniform points."""
     grid, bins = Grid(6, 6, 12, phi_i=12), FOUR[[0, 3]]
     i, a, o, b = bins.T
     means = []

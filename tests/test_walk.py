@@ -1,7 +1,7 @@
-"""The layered walk against answers known without it (CONVENTIONS.md, "Facts to test against").
+"""The random walk of the layered source, compared with results that are known without it.
 
-Statistical tests compare means of walks with the known value by a Z-test. Each test's chance of a false alarm is
-`FALSE_ALARM`, shared among its comparisons by Sidak's correction; seeds are fixed, so a test that passes keeps passing.
+Statistical tests compare the mean of walks with the known value by a Z-test. A test has the false-alarm rate
+`FALSE_ALARM`, divided among its comparisons by Sidak's correction. Seeds are fixed, so a passing test keeps passing.
 """
 
 import numpy as np
@@ -19,21 +19,21 @@ Float, PCG32 = dr.auto.Float, dr.auto.PCG32
 FALSE_ALARM = 1e-3
 WALKS = 1 << 18
 
-# A mirror of any colour; a coat that is not there; a surface that reflects nothing.
+# A conductor that reflects all light, a coat without effect, and a conductor that reflects no light.
 WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
 NO_COAT = {"eta_top": 1.0, "alpha_top": 1e-4}
 BLACK = {"eta_conductor": 1.0, "k_conductor": 0.0, "alpha_bottom": 1e-4}
-# Facets this narrow are flat in single precision.
+# Surfaces with microfacets this narrow are flat in single precision.
 FLAT = {"alpha_top": 1e-7, "alpha_bottom": 1e-7}
 
 
 def lanes(value, n):
-    """The value in n lanes, without becoming a constant of the kernel: all materials share one."""
+    """The value in n lanes, opaque to the compiler, so that all materials share one kernel."""
     return dr.opaque(Float, float(value)) + dr.zeros(Float, n)
 
 
 def albedo(mu, n=WALKS, seed=1, **values):
-    """Mean throughput of n walks from cos(theta_i) = mu, and its standard error, each (3,)."""
+    """The mean throughput (3,) of n walks from cos(theta_i) = mu, and its standard error (3,)."""
     source = Layered3()
     columns = [lanes(c, n) for c in LAYERED3.vector({"albedo": 1.0, "sigma_t": 0.0, **values})]
     wi = Vec3(lanes(np.sqrt(1.0 - mu * mu), n), dr.zeros(Float, n), lanes(mu, n))
@@ -44,7 +44,7 @@ def albedo(mu, n=WALKS, seed=1, **values):
 
 
 def assert_equal_means(found, error, expected):
-    """Two-sided Z-test of every `found` (standard error `error`) against `expected`."""
+    """Two-sided Z-tests that compare each number in `found`, with its standard error, with `expected`."""
     found, error, expected = np.broadcast_arrays(found, error, expected)
     z = np.abs(found - expected) / np.maximum(error, 1e-6)
     limit = norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / z.size)))
@@ -54,7 +54,7 @@ def assert_equal_means(found, error, expected):
 @pytest.mark.parametrize("eta_top", (1.05, 1.5, 2.0))
 @pytest.mark.parametrize("sigma_t", (0.0, 1.0, 3.0))
 def test_white_furnace_loses_nothing(eta_top, sigma_t):
-    """Nothing absorbs, so everything comes back, however long it takes; the only roulette is that of trapped walks."""
+    """Nothing absorbs light, so the albedo is 1, however long walks are. Roulette may only end trapped walks."""
     results = [
         albedo(mu, 1 << 16, eta_top=eta_top, sigma_t=sigma_t, **WHITE, **FLAT) for mu in (1.0, 0.3, 0.05)
     ]
@@ -62,16 +62,19 @@ def test_white_furnace_loses_nothing(eta_top, sigma_t):
 
 
 def test_perfect_mirror_under_smooth_coat_ends():
-    """Near grazing, a walk that a rare facet tilts beyond the critical angle must not stay under the coat for ever."""
+    """A rare facet may tilt a grazing walk beyond the critical angle. The walk must still leave the coat or end."""
     found, _ = albedo(0.001, 1 << 15, eta_top=2.0, **WHITE, **FLAT)
     np.testing.assert_allclose(found, 1.0, atol=0.01)
 
 
 def test_bare_rough_conductor():
-    """Single scattering on a white conductor at normal incidence, by quadrature; 1 - ln 2 for alpha 1."""
+    """Albedos of single scattering on a white conductor at normal incidence. They are from quadrature.
+
+    For alpha 1, the albedo is 1 - ln 2.
+    """
     known = {0.1: 0.98830, 0.3: 0.87736, 0.6: 0.59152, 1.0: 1.0 - np.log(2.0)}
     found, error = zip(*(albedo(1.0, alpha_bottom=a, **NO_COAT, **WHITE) for a in known), strict=True)
-    # The values above are known to five digits.
+    # The known albedos have five digits.
     assert_equal_means(found, np.array(error) + 0.5e-5 / 3.3, np.array(list(known.values()))[:, None])
 
 
@@ -83,7 +86,7 @@ def fresnel_dielectric(cos_i, eta):
 
 
 def fresnel_conductor(cos_i, index):
-    """By complex arithmetic, unlike the package's own."""
+    """The reflectance of a conductor, in complex arithmetic; the package uses real arithmetic."""
     cos_t = np.sqrt(1.0 - (1.0 - cos_i**2) / index**2 + 0j)
     r_s = (cos_i - index * cos_t) / (cos_i + index * cos_t)
     r_p = (index * cos_i - cos_t) / (index * cos_i + cos_t)
@@ -92,7 +95,10 @@ def fresnel_conductor(cos_i, index):
 
 @pytest.mark.parametrize("eta_top", (1.05, 1.5, 2.0))
 def test_smooth_interfaces_without_medium(eta_top):
-    """A geometric series of reflections between coat and conductor, whose index is relative to the coat's."""
+    """Reflections between coat and conductor form a geometric series.
+
+    The conductor's index of refraction is relative to the coat's.
+    """
     eta, k = np.array([0.2, 1.4, 7.5]), np.array([3.9, 0.0, 2.3])
     results = []
     for mu in (1.0, 0.7, 0.2, 0.02):
@@ -104,10 +110,11 @@ def test_smooth_interfaces_without_medium(eta_top):
 
 
 def slab_albedo(mu, depth, rho, n=300):
-    """Reflectance (mus, rhos) of an isotropically scattering slab over black, from its collision density.
+    """The reflectance (mus, rhos) of an isotropically scattering slab over black, from its collision density C.
 
-    C(x) = exp(-x / mu) / mu + rho/2 int E1(|x - y|) C(y) dy, and what leaves is rho/2 int E2(x) C(x) dx (Chandrasekhar
-    1960, sections 11 and 58): midpoints, with the singularity of E1 integrated in closed form.
+    C(x) = exp(-x / mu) / mu + rho/2 int E1(|x - y|) C(y) dy. The reflectance is rho/2 int E2(x) C(x) dx (Chandrasekhar
+    1960, sections 11 and 58). The integrals use the midpoint rule, and the singularity of E1 is integrated in closed
+    form.
     """
     x = (np.arange(n) + 0.5) * depth / n
     kernel = (
@@ -131,7 +138,7 @@ def test_slab_albedo_itself():
 
 
 def test_isotropic_slab_over_black():
-    """The medium alone: three albedos at once, in its three channels."""
+    """The medium alone. Its three channels have three different albedos."""
     rho, mus = np.array([1.0, 0.9, 0.3]), np.array([1.0, 0.4, 0.1])
     for depth in (0.1, 1.0, 3.0):
         slab = {"sigma_t": depth, "albedo": rho, **NO_COAT, **BLACK}
@@ -140,7 +147,7 @@ def test_isotropic_slab_over_black():
 
 
 def test_rough_coat_over_white_conductor():
-    """The case in which two public codes' evaluation and walks disagree, known to three digits."""
+    """The albedo is known to three digits. In this case, evaluation and walks of two public programs disagree."""
     found, error = albedo(0.9, 1 << 20, eta_top=1.5, alpha_top=0.2, alpha_bottom=0.4, **WHITE)
     assert_equal_means(found, error + 0.5e-3 / 3.3, 0.556)
 
