@@ -1,1 +1,1 @@
-"""Experiments: what the figures and tables of the project are made by."""
+"""Experiments: the scripts that make the figures and tables of the project."""

@@ -1,9 +1,9 @@
 """Lists the experiments, or runs them.
 
-python -m figures                     what there is
+python -m figures                     list all experiments
 python -m figures all [--quick]       run all of them
-python -m figures NAME ... [--quick]  run some
-python -m figures.NAME.run --help     what one of them takes
+python -m figures NAME ... [--quick]  run some of them
+python -m figures.NAME.run --help     show the options of one experiment
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 
 
 def experiments() -> dict[str, Path]:
-    """Name and script of every experiment: the folders that have a `run.py`."""
+    """Name and script of every experiment. An experiment is a folder here with a `run.py`."""
     return {script.parent.name: script for script in sorted(HERE.glob("*/run.py"))}
 
 
@@ -31,7 +31,7 @@ def main() -> None:
         return
     unknown = set(wanted) - {"all", *known}
     if unknown:
-        sys.exit(f"no experiment {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+        sys.exit(f"no experiment {', '.join(sorted(unknown))}; the experiments are {', '.join(known)}")
     for name in known if "all" in wanted else wanted:
         command = [sys.executable, "-m", f"figures.{name}.run", *quick]
         print(f"== {name}: {' '.join(command[1:])}", flush=True)

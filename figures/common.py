@@ -1,4 +1,4 @@
-"""What the experiments share: their command line, where results go, references, and how results are written."""
+"""Shared by the experiments: the command line, the folders of results, the reference tables, and writing results."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from nma.params import Population
 
 ROOT = Path(__file__).parent.parent
 REFERENCES = ROOT / "out/references"
-# Measured materials, which are no part of this repository.
+# The folder of measured materials. They are not part of this repository.
 DATA = Path(os.environ.get("NMA_TEST_DATA") or ROOT.parent / "shared/data")
-# The sets of unseen materials: (materials, population, seed).
+# The sets of unseen materials: (number of materials, population, seed).
 SETS: dict[str, tuple[int, Population, int]] = {
     "range": (89, "range", 89),
     "metals": (60, "unseen_metals", 60),
@@ -35,14 +35,14 @@ REFERENCE_WALKS = 64_000_000
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
-    """A command line with `--quick`, described by the script's docstring."""
+    """A command-line parser with `--quick`; `doc` is the script's docstring."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--quick", action="store_true", help="less of everything, in under two minutes")
+    made.add_argument("--quick", action="store_true", help="a small, short run, in under two minutes")
     return made
 
 
 def results(script: str, quick: bool) -> Path:
-    """Where results go: beside the script, quick ones to out/figures/NAME."""
+    """The folder for results: the script's own folder, or out/figures/NAME for a quick run."""
     home = Path(script).resolve().parent
     folder = ROOT / "out/figures" / home.name if quick else home
     folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
 
 
 def reference(name: str, quick: bool) -> nma.Tables:
-    """The reference tables of a set, simulated with `nma simulate` if they are not there yet."""
+    """The reference tables of a set in SETS. If the file does not exist, `nma simulate` makes it."""
     count, population, seed = SETS[name]
     count, walks = (4, 4_000_000) if quick else (count, REFERENCE_WALKS)
     path = REFERENCES / f"{name}-{count}x{walks}.npz"
@@ -69,7 +69,7 @@ def reference(name: str, quick: bool) -> nma.Tables:
     words = [str(word) for option in options.items() for word in option]
     REFERENCES.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:
-        # Experiments that run at the same time wait for each other's simulation.
+        # If another experiment is simulating the same set, wait for it.
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
@@ -77,7 +77,8 @@ def reference(name: str, quick: bool) -> nma.Tables:
 
 
 def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
-    """What `make` returned when it was first called for this JSON file, or returns now."""
+    """Returns the content of a JSON file. If the file does not exist, or with `again`, calls `make` and writes its
+    result to the file first."""
     if again or not path.exists():
         files.write_text(path, json.dumps(make()))
     return json.loads(path.read_text())
@@ -92,8 +93,14 @@ def save_array(path: Path, array: NDArray) -> None:
 def figures(
     adapter: nma.Adapter, tables: nma.Tables, directions: int | None = None
 ) -> list[dict[str, float]]:
-    """The adapter's figures for every material, integrated once; `nma.evaluate_adapter` does so twice to know how
-    exact it is. The tables must have standard errors."""
+    """The adapter's figures for every material of the tables. The tables must have standard errors.
+
+    This integrates the adapter over the bins once. `nma.evaluate_adapter` integrates twice, to measure its own
+    accuracy.
+
+    Args:
+        directions: how many values of cos(theta_i) per row of a table; None for the default of `tabulate_adapter`.
+    """
     assert tables.error is not None
     return [
         table_metrics(nma.tabulate_adapter(adapter, params[None], directions=directions)[0], table, error)
@@ -102,5 +109,5 @@ def figures(
 
 
 def row(angle: float, rows: int) -> int:
-    """The row of a table that holds this angle of incidence [degrees]."""
+    """The index of the table row that contains this angle of incidence [degrees]; the table has `rows` rows."""
     return min(int(math.cos(math.radians(angle)) * rows), rows - 1)

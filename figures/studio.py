@@ -1,4 +1,4 @@
-"""Shader balls of unseen materials under light that shows a material and little noise."""
+"""Renders shader balls of unseen materials, in soft light that makes little noise."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from nma.render.lighting import LAMP_RADIANCE
 from nma.render.load import load_dict
 from nma.render.progressive import render_passes
 
-# The soft box's side in those of the scene's lamp.
+# The side of the soft box, relative to the side of the scene's lamp.
 SOFT_BOX = 7
 
 
 def material(number: int, params: NDArray[np.float64]) -> Material:
-    """A validation material by its place in the set."""
+    """A validation material with its parameters (13,); `number` is its index in the set."""
     return Material.of_vector(f"validation-material-{number}", params, nma.LAYERED3)
 
 
 def describe(material: Material) -> str:
-    """A material's widths, optical depth and index in a line."""
+    """One line with the material's widths, index of refraction and optical depth."""
     short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
     return short.format(material.title, **material.values)
 
 
 def worst_to_median(errors: ArrayLike, count: int) -> NDArray[np.intp]:
-    """Indices at even steps from the largest error to the median, fewer than `count` if there are not as many."""
+    """Indices at even steps from the largest error to the median: `count` of them, or fewer if there are too few."""
     worst_first = np.argsort(errors)[::-1]
     return worst_first[np.unique(np.linspace(0, len(worst_first) // 2, count).astype(int))]
 
@@ -42,8 +42,10 @@ def render(
 
 
 def scene(bsdf: dict[str, Any], size: int, sampler: str = "independent") -> dict[str, Any]:
-    """The preview scene under a sky without a sun and a soft box in place of the lamp, with one bounce of light: the
-    noise of small lights and caustics would hide what tells adapters apart."""
+    """The preview scene under a sky without a sun, with a soft box in place of the lamp and one bounce of light.
+
+    Small lights and caustics would make noise, and this noise would hide the differences between adapters.
+    """
     made = nma.preview_scene(bsdf, size=(size, size), lighting="outdoors", hide_sun=True, max_depth=3)
     made["sensor"]["sampler"]["type"] = sampler
     made["lamp"]["to_world"] = made["lamp"]["to_world"].scale(SOFT_BOX)

@@ -2,8 +2,8 @@
 
     python -m figures.ablation.run [--quick] [--data layered3.zarr] [--steps 15000]
 
-Trains from a dataset of 8000 materials (made with `nma dataset layered3 FOLDER --seed 1`) and evaluates on every third
-material of both sets. A run that was finished is not repeated: its figures wait in out/figures/ablation.
+Trains on a dataset of 8000 materials, which `nma dataset layered3 FOLDER --seed 1` makes, and evaluates on every third
+material of both sets. The figures of finished trainings are kept in out/figures/ablation, so they are not repeated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import preset
 from nma.train.run import train_class
 
-# What changes, by name. The paper's recipe sees as many bins in total, at its own learning rate and at higher ones.
+# The changed settings, by name. The paper's recipe sees as many bins in total as ours. It runs at its own learning rate
+# and at higher ones.
 CHANGES: dict[str, dict[str, Any]] = {
     "class": {},
     "no albedo": {"albedo": 0.0},
@@ -51,14 +52,13 @@ def main() -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--data", type=Path, default=common.ROOT / "out/layered3.zarr")
     parser.add_argument("--steps", type=int, default=15_000, help="steps of the preset `class`")
-    parser.add_argument("--only", nargs="*", help="some of the changes")
+    parser.add_argument("--only", nargs="*", help="run only these changes")
     arguments = parser.parse_args()
     folder = common.results(__file__, arguments.quick)
     names = arguments.only or list(CHANGES)[: 2 if arguments.quick else None]
     steps = 100 if arguments.quick else arguments.steps
-    # Every third material.
     references = {name: common.reference(name, arguments.quick)[::3] for name in common.SETS}
-    # Read when a training first needs them.
+    # The dataset is read when a training first needs it.
     tables = cache(lambda: data(arguments.data, arguments.quick))
     results = {}
     for name in names:
@@ -78,7 +78,8 @@ def data(path: Path, quick: bool) -> nma.Tables:
 
 
 def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma.Tables], steps: int) -> dict:
-    """Figures of one change. Every run sees as many bins as the preset `class` does in `steps`."""
+    """Trains with one change, and returns the figures. Every training sees as many bins as the preset `class` sees in
+    `steps` steps."""
     change = dict(CHANGES[name])
     recipe = preset(change.pop("preset", "class"), **change)
     recipe = replace(recipe, steps=steps * preset("class").bins_per_step // recipe.bins_per_step)
@@ -93,7 +94,7 @@ def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma
 
 
 def plot(results: dict, path: Path) -> None:
-    """Bars of log loss and albedo error for both sets."""
+    """Draws log loss and albedo error of every change as bars, for both sets."""
     figure = Figure(figsize=(10, 1.2 + 0.35 * len(results)), layout="constrained")
     names, places = list(results), np.arange(len(results))
     for axes, quantity in zip(figure.subplots(1, 2, sharey=True), ("log_loss", "albedo_error"), strict=True):

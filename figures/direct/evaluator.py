@@ -1,8 +1,9 @@
 """A network that evaluates f cos(theta_o) itself: a latent per material, and a decoder of about a million weights.
 
-It has the latent size and about the decoder size of Fan et al. 2022, "Neural Layered BRDFs", as the paper states them;
-everything else is ours, as their weights and data are not to be had. To be a fair opponent it sees half-vector
-coordinates (Rusinkiewicz 1998), in which highlights are simple, and learns with the adapter's data, loss and optimiser.
+The latent size, and roughly the decoder size, are those of Fan et al. 2022, "Neural Layered BRDFs", as the NMA paper
+states them. Their weights and data are not available, so everything else is ours. To make the comparison fair, the
+network sees half-vector coordinates (Rusinkiewicz 1998), in which highlights are simple, and it learns with the
+adapter's data, loss and optimiser.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ from nma.train.recipe import Recipe, preset
 
 LATENT = 32
 FEATURES = 6
-# log(1 + f cos) starts about here.
+# The untrained network predicts about this value of log(1 + f cos).
 _INITIAL = 0.05
-# The sine of the half vector's angle, below which highlights look alike.
+# The network cannot tell half vectors apart whose sines are far below this value.
 _SHARPEST = 1e-3
 
 
 class Evaluator(NamedTuple):
-    """What is trained: latents (materials, LATENT), and the decoder from latent and directions to log(1 + f cos)."""
+    """What is trained: latents (materials, LATENT), and a decoder from latent and directions to log(1 + f cos)."""
 
     latents: Any
     decoder: Layers
 
 
 def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
-    """The adapter's recipe where it applies: data, bins, loss, schedule, averaging."""
+    """The adapter's recipe as far as it applies: data, bins, loss, schedule and averaging of weights."""
     return preset(
         "class",
         network=network_name,
@@ -57,7 +58,7 @@ def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
 
 
 def start(materials: int, how: Recipe) -> Evaluator:
-    """Random latents and layers."""
+    """Random latents and layers, from the recipe's seed."""
     rng = np.random.default_rng((how.seed, 0xD1EC7))
     sizes = [LATENT + FEATURES, *network.hidden(how.network), 3]
     decoder = network.init(rng, sizes, np.full(3, np.log(np.expm1(_INITIAL))))
@@ -66,14 +67,15 @@ def start(materials: int, how: Recipe) -> Evaluator:
 
 
 def evaluate(decoder: Layers, latent: Any, wi: Vec3, wo: Vec3) -> Any:
-    """f cos(theta_o) [1/sr], (..., 3), on JAX; `latent` (..., LATENT)."""
+    """f cos(theta_o) [1/sr], (..., 3), as a JAX array; `latent` has the shape (..., LATENT)."""
     seen = jnp.stack(_features(wi, wo), axis=-1)
     latent = jnp.broadcast_to(latent, (*seen.shape[:-1], LATENT))
     return jnp.expm1(jax.nn.softplus(network.forward(decoder, jnp.concatenate([latent, seen], axis=-1))))
 
 
 def _features(wi: Vec3, wo: Vec3) -> list[Any]:
-    """Cosines of wi, wo, half and difference angle, the half angle's logarithm, the azimuth's cosine; about -1..1."""
+    """The network's inputs, about -1 .. 1: the cosines of wi, wo, half angle and difference angle, the logarithm of the
+    half angle's sine, and the cosine of the azimuth."""
     half = ops.normalize(wi + wo)
     sine = ops.safe_sqrt(half.x * half.x + half.y * half.y)
     narrow = ops.log(sine + _SHARPEST) / np.log(_SHARPEST)
@@ -91,7 +93,11 @@ def train(
     progress: Callable[[loop.Run], None],
     decoder: Layers | None = None,
 ) -> tuple[Evaluator, loop.Run]:
-    """Latents of some materials, with the decoder or for a given one; goes on from the checkpoint."""
+    """Trains the latents of the tables' materials, and continues from the checkpoint if there is one.
+
+    Args:
+        decoder: a decoder that stays fixed; if None, the decoder is trained with the latents.
+    """
     fresh = start(len(tables.params), how)
     begin = fresh if decoder is None else fresh._replace(decoder=decoder)
     run = loop.resume(how, begin, checkpoint, record)
@@ -109,13 +115,13 @@ def train(
 
 
 def _numbered(tables: nma.Tables) -> Pool:
-    """A pool whose materials have their number for a parameter, to find their latents by."""
+    """A pool of the tables. The only parameter of a material is its number, which selects its latent."""
     numbers = np.arange(len(tables.params), dtype=np.float64)[:, None]
     return Pool.of(replace(tables, params=numbers))
 
 
 def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The adapter's distance, with one random point in each bin for its mean."""
+    """The adapter's loss; one random point in each bin stands for the bin's mean."""
     points = quadrature.uniform_bin_points(batch.i, batch.o, batch.p, tuple(batch.shift))
     latent = evaluator.latents[batch.columns[0].astype(jnp.int32)]
     wi = Vec3(*(jnp.broadcast_to(x, points.wo.z.shape) for x in points.wi))
@@ -124,5 +130,5 @@ def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Arr
 
 
 def _latents_alone(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The same for a decoder that stays as it is."""
+    """As `_objective`, but the decoder stays fixed."""
     return _objective(evaluator._replace(decoder=jax.lax.stop_gradient(evaluator.decoder)), batch, how)

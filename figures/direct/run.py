@@ -1,10 +1,11 @@
-"""Paper Table 5 and Fig. 11: the adapters beside a network of a million weights that evaluates f itself.
+"""Paper Table 5 and Fig. 11: the adapters compared with a network of a million weights that evaluates f itself.
 
     python -m figures.direct.run [--quick] [--data FOLDER.zarr] [--steps N] [--latent-steps N]
 
-Trains a latent per material and a decoder (evaluator.py) on the adapters' dataset, then latents of the 89 validation
-materials on their own references, as the paper does for Fan et al. 2022; the adapters see their parameters alone. Both
-are judged by the mean of random points in every bin. The trainings go on from checkpoints in out/figures/direct.
+Trains a decoder, and a latent for each material, on the adapters' dataset (evaluator.py). Then it trains latents of the
+89 validation materials on the materials' own references, as the paper does for Fan et al. 2022. The adapters see only
+the parameters of these materials. Both kinds of model are evaluated at random points, which are averaged in every bin.
+Trainings continue from checkpoints in out/figures/direct.
 Writes direct.json, direct.md and direct.png beside this file; with --quick, of a small network, to out/figures/direct.
 """
 
@@ -36,11 +37,11 @@ from nma.table.dataset import Settings, simulate_block
 
 SET = "range"
 NETWORK, QUICK_NETWORK = "5x512", "2x32"
-# Points per bin, as in the paper. The direct evaluator gets fewer: it is slow, and smooth within a bin.
+# Points per bin, as in the paper. The direct evaluator gets fewer points, because it is slow and smooth within a bin.
 POINTS, DIRECT_POINTS = 10, 2
-# Points that are evaluated at a time.
+# How many points are evaluated at a time.
 BATCH = 8192
-# The paper's 40 x 80 x 40 x 80 bins; of an isotropic material, ours hold all of their values.
+# The paper has 40 x 80 x 40 x 80 bins. Ours are fewer, but hold all of their values if the material is isotropic.
 PAPER_POINTS = 40 * 80 * 40 * 80 * 10
 COLUMNS = {
     "ae": "AE",
@@ -49,21 +50,21 @@ COLUMNS = {
     "log_loss": "log loss",
     "albedo_error": "albedo error",
 }
-# Table 5 (an RTX 4090).
+# The paper's Table 5, measured on an RTX 4090.
 PAPER = {
     "paper: NMA 5x64": {"ae": 0.0065, "psnr": 45.5, "smape": 0.100, "log_loss": 0.0037, "seconds": 3.76},
     "paper: Fan et al.": {"ae": 0.0130, "psnr": 39.7, "smape": 0.257, "log_loss": 0.0100, "seconds": 99.78},
 }
-# From points (n,) to f cos(theta_o) (n, 3) of the material with this number.
+# A function of a material's number, wi and wo (n,) that returns f cos(theta_o) (n, 3).
 Evaluate = Callable[[int, Vec3, Vec3], NDArray]
 
 
 def main() -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--data", type=Path, default=common.ROOT / "out/layered3.zarr", help="a dataset")
-    parser.add_argument("--steps", type=int, default=4000, help="of the direct evaluator's training")
+    parser.add_argument("--steps", type=int, default=4000, help="steps of the direct evaluator's training")
     parser.add_argument(
-        "--latent-steps", type=int, default=1500, help="for the validation materials' latents"
+        "--latent-steps", type=int, default=1500, help="steps for the validation materials' latents"
     )
     arguments = parser.parse_args()
     if arguments.quick:
@@ -93,12 +94,12 @@ def main() -> None:
 
 
 def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict[str, Any]]:
-    """The evaluator with latents of the validation materials, and what its training took."""
+    """Returns the evaluator with latents of the validation materials, and the bins and seconds of its training."""
     quick, kept = arguments.quick, common.ROOT / "out/figures/direct"
     kept.mkdir(parents=True, exist_ok=True)
     settings, tables = data(arguments.data, quick)
     how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
-    # The validation set decides nothing about the decoder.
+    # The decoder is trained without the validation set.
     stem = f"{how.network}_{settings.materials}_{how.steps}-steps"
     record: dict[str, Any] = {"dataset": asdict(settings)}
     with console.TrainingBar(how, "decoder") as bar:
@@ -124,7 +125,7 @@ def data(path: Path, quick: bool) -> tuple[Settings, nma.Tables]:
 
 
 def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
-    """The adapter, its network run at every point like the paper's."""
+    """The adapter as a function of points. Its network runs at every point, as in the paper."""
     encode, materials = encoding.get(adapter.encoding), params.astype(np.float32)
 
     def at_points(material: jax.Array, wi: Vec3, wo: Vec3) -> jax.Array:
@@ -142,7 +143,7 @@ def of_evaluator(trained: direct.Evaluator) -> Evaluate:
 
 
 def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any, Vec3, Vec3], NDArray]:
-    """The function, compiled, on batches that fit the cache of a CPU."""
+    """Compiles the function, and runs it on batches that fit into the cache of a CPU."""
 
     @jax.jit
     def compiled(material: Any, wi: Vec3, wo: Vec3) -> jax.Array:
@@ -158,7 +159,7 @@ def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any,
 
 
 def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, Any]:
-    """Figures of every material with their means, and seconds for as many points as the paper has."""
+    """Returns the figures of every material, their means, and the seconds for PAPER_POINTS points."""
     i, o, p = np.stack(np.unravel_index(np.arange(ISOTROPIC.bins), ISOTROPIC.shape[:3])).astype(np.float32)
     assert reference.error is not None
     materials, seconds = [], []
@@ -173,7 +174,7 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
         materials.append(table_metrics(mean, table, reference.error[number]))
     rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
     means = {k: round(v, 6) for k, v in mean_metrics(materials).items()}
-    # The median leaves out the first material, which waits for the compiler.
+    # The first material includes compilation. The median ignores it.
     return {
         "mean": means,
         "seconds": round(float(np.median(seconds)) * PAPER_POINTS, 2),
@@ -182,7 +183,7 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
 
 
 def figures(materials: list[dict[str, float]]) -> dict[str, Any]:
-    """Means over the materials, and each one's figures."""
+    """The figures of each material, rounded, and their means."""
     rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
     return {"mean": {k: round(v, 6) for k, v in mean_metrics(materials).items()}, "materials": rounded}
 
@@ -192,7 +193,7 @@ def print_means(name: str, result: dict[str, Any]) -> None:
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """Table 5 with the paper's rows."""
+    """Our Table 5 in Markdown, with the paper's rows below ours."""
     lines = ["| | " + " | ".join(COLUMNS.values()) + " | time, s | parameters |", "|---" * 8 + "|"]
     for name, result in results.items():
         cells = [f"{result['mean'][k]:.4g}" for k in COLUMNS]
@@ -209,7 +210,7 @@ def markdown(results: dict[str, Any]) -> str:
 
 
 def plot(results: dict[str, Any], path: Path) -> None:
-    """Fig. 11: absolute error and log loss of every material, in the order of the first adapter's."""
+    """Draws Fig. 11: absolute error and log loss of every material, sorted by the direct evaluator's absolute error."""
     curves: dict[str, tuple[list, dict[str, Any]]] = {}
     for name, result in results.items():
         if "exact" in result:

@@ -2,9 +2,10 @@
 
     python -m figures.energy.run [--quick]
 
-Albedos are means of value / pdf over samples of the target itself. All pairs of material and angle are estimated
-coarsely, the brightest ones again with more and more samples; each round says how far two independent estimates differ.
-The same is done with the bound taken away. Writes energy.json and energy.png beside this file.
+An albedo is the mean of value / pdf over samples of the target itself. The first round estimates all pairs of material
+and angle coarsely. Each further round estimates the brightest pairs again, with more samples. Every round makes two
+independent estimates; their difference gives the error. All rounds are repeated without the energy bound. Writes
+energy.json and energy.png beside this file.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from nma.table import quadrature
 
 ANGLES = 64
 CHUNK = 1_000_000
-# (pairs that are looked at, samples for each) from round to round; the first looks at all.
+# For each round: how many pairs are estimated (None for all), and how many samples each pair gets.
 ROUNDS = ((None, 64), (50_000, 1024), (2_000, 16_384), (100, 2**20))
 QUICK_ROUNDS = ((None, 64), (1_000, 1024), (100, 2**16))
 
@@ -45,7 +46,7 @@ def main() -> None:
 
 
 def measure(adapter: nma.Adapter, params: np.ndarray, rounds: tuple) -> tuple[dict, np.ndarray]:
-    """The largest albedo with its place and its error, and the largest coarse estimate at each angle."""
+    """Returns the largest albedo with its error, material and angle; and the largest coarse estimate at each angle."""
     mu = (np.arange(ANGLES) + 0.5) / ANGLES
     pairs = np.arange(len(params) * ANGLES)
     coarse, result = np.empty(0), {}
@@ -59,7 +60,7 @@ def measure(adapter: nma.Adapter, params: np.ndarray, rounds: tuple) -> tuple[di
             envelope = coarse.reshape(len(params), ANGLES).max(axis=0)
         result = {
             "largest_albedo": round(float(coarse[best]), 5),
-            # The mean of two estimates is off by about half of their difference.
+            # The error of the mean of two estimates is about half of their difference.
             "error": round(float(np.abs(estimates[0] - estimates[1]).mean() / 2), 6),
             "pairs_above_1": int((coarse > 1.0005).sum()),
             "cos_theta_i": float(mu[pairs[best] % ANGLES]),
@@ -71,7 +72,14 @@ def measure(adapter: nma.Adapter, params: np.ndarray, rounds: tuple) -> tuple[di
 def albedos(
     adapter: nma.Adapter, params: np.ndarray, mu: np.ndarray, pairs: np.ndarray, samples: int, shift: float
 ) -> np.ndarray:
-    """The brightest channel's albedo for pairs of a material and an angle, from `samples` samples each."""
+    """The albedo of the brightest channel for each pair of material and angle, from `samples` samples each.
+
+    Args:
+        params: materials (n, 13).
+        mu: cosines of the angles (ANGLES,).
+        pairs: material * ANGLES + angle, for each pair.
+        shift: moves the sample points (in units of their period); another shift makes another estimate.
+    """
     chunk = max(1, min(CHUNK, 2**28 // samples))
     parts = np.array_split(pairs, -(-len(pairs) // chunk))
     return np.concatenate(
@@ -95,14 +103,14 @@ def _albedos(
         weights = [Sum(dr.select(pdf > 0, c / pdf, 0.0)) for c in value]
         return k + 1, *(s + w for s, w in zip(sums, weights, strict=True))
 
-    # In single precision a million terms would be rounded the same way.
+    # Sums are in double precision. In single precision, the rounding errors of a million terms would add up.
     start: Any = (dr.zeros(UInt32, len(mu)), *(dr.zeros(Sum, len(mu)) for _ in range(3)))
     sums = dr.while_loop(start, lambda k, *_: k < samples, body, mode="symbolic", label="albedo")[1:]
     return np.max([s.numpy() for s in sums], axis=0) / samples
 
 
 def plot(curves: dict[str, np.ndarray], path: Path) -> None:
-    """The largest albedo of all materials over the angle, coarse estimates."""
+    """Draws the largest albedo of all materials over the angle, from the coarse estimates."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot(
         xlabel="cos(theta_i)",

@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def fit(name: str, walks: int, reference_walks: int, quick: bool) -> dict:
-    """Fits one material as `nma fit` does and evaluates it; the two random streams are independent."""
+    """Fits one material as `nma fit` does, and evaluates the fit on a reference from an independent random stream."""
     source, vector = nma.source("layered3"), nma.load_material(name).vector()
     recipe = preset("single", steps=500 if quick else None)
     began = time.perf_counter()
@@ -55,7 +55,7 @@ def fit(name: str, walks: int, reference_walks: int, quick: bool) -> dict:
 
 
 def plot(rows: list[dict], path: Path) -> None:
-    """Bars of log loss and albedo error per material, with the references' noise."""
+    """Draws log loss and albedo error of every material as bars, with the noise of the references."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     names = [row["name"] for row in rows]

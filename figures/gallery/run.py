@@ -1,11 +1,15 @@
-"""The named materials in the preview scene, its two lightings side by side, and the noise that each leaves.
+"""The named materials in the preview scene, the two lightings of this scene, and the noise in each lighting.
 
     python -m figures.gallery.run [--quick] [--adapter FILE]
 
-Writes gallery.png, every named material and one with textures; lighting.png, six materials by either lighting; and
-gallery.json, the noise of six pictures of 128 samples per pixel, as `nma render` made them before there was a studio,
-makes them now, and with samples clamped. With --quick, two materials, small and with few samples, to
-out/figures/gallery.
+Writes three files beside this one:
+
+gallery.png   every named material, and one with textures
+lighting.png  six materials in both lightings
+gallery.json  the noise of pictures with 128 samples per pixel: as `nma render` made them before it had a studio, as it
+              makes them now, and with clamped samples
+
+With --quick, two materials, in small pictures of few samples, to out/figures/gallery.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ from nma.render.progressive import render_passes, sampler
 
 Image = NDArray[np.float32]
 COLUMNS = 5
-# A pair of colour and metal, two wet metals, two paints, and one that scatters.
+# Six materials of different looks: two coloured or wet coats, two paints, a dark metal, and a metal under a white haze.
 SIX = (
     "gold-red-lacquer",
     "wet-nickel",
@@ -41,12 +45,18 @@ SIX = (
     "frosted-silver",
 )
 CLAMP = 5.0
-FIREFLY, VISIBLE = 5.0, 0.02  # times brighter than the median of its neighbours, and by so much at least
+FIREFLY, VISIBLE = (
+    5.0,
+    0.02,
+)  # a firefly is FIREFLY times, and at least VISIBLE, brighter than its neighbours' median
 
 
 class Effort(NamedTuple):
-    """Pixels on a side and samples per pixel of the sheets' pictures, of those whose noise is measured, and of theirs
-    that are converged."""
+    """Pixels on a side and samples per pixel.
+
+    `size` and `spp` are for the two sheets of pictures, `noise_size` and `noise_spp` for the pictures whose noise is
+    measured. `reference_spp` is for the converged pictures that they are compared with.
+    """
 
     size: int = 208
     spp: int = 256
@@ -56,7 +66,7 @@ class Effort(NamedTuple):
 
 
 class Way(NamedTuple):
-    """How pictures are made whose noise is measured."""
+    """One way to render a picture: the lighting, the sampler, and the value at which samples are clamped, if any."""
 
     lighting: str
     sampler: str
@@ -100,7 +110,7 @@ def textured(adapter: str) -> dict[str, Any]:
 
 
 def render(bsdf: dict[str, Any], size: int, spp: int, way: Way, seed: int = 0) -> Image:
-    """A picture of the ball."""
+    """A picture (size, size, 3) of the ball with this BSDF."""
     options: dict[str, Any] = {"size": (size, size), "lighting": way.lighting, "sampler": way.sampler}
     scene = load_dict(nma.preview_scene(bsdf, **options))
     integrator = clamped(scene.integrator(), way.clamp) if way.clamp else None
@@ -108,7 +118,7 @@ def render(bsdf: dict[str, Any], size: int, spp: int, way: Way, seed: int = 0) -
 
 
 def gallery(shown: dict[str, dict[str, Any]], effort: Effort, path: Path) -> None:
-    """One picture of each, in rows."""
+    """Writes a sheet with one picture of each BSDF, in rows of COLUMNS pictures."""
     size, spp = effort.size, effort.spp
     way = Way("studio", sampler(spp, size * size))
     pictures: list[NDArray] = [render(bsdf, size, spp, way) for bsdf in shown.values()]
@@ -125,7 +135,7 @@ def gallery(shown: dict[str, dict[str, Any]], effort: Effort, path: Path) -> Non
 
 
 def wrapped(title: str, width: int = 28) -> str:
-    """At most two lines, parted at a word."""
+    """Splits a title that is too long into two lines, at a space."""
     if len(title) <= width:
         return title
     cut = title.rindex(" ", 0, width)
@@ -133,7 +143,7 @@ def wrapped(title: str, width: int = 28) -> str:
 
 
 def lightings(six: dict[str, dict[str, Any]], effort: Effort, path: Path) -> None:
-    """The former light above the studio."""
+    """Writes a sheet with the six materials outdoors in the upper row and in the studio in the lower row."""
     size, spp = effort.size, effort.spp
     kind = sampler(spp, size * size)
     rows = [
@@ -145,7 +155,8 @@ def lightings(six: dict[str, dict[str, Any]], effort: Effort, path: Path) -> Non
 
 
 def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str, float]]:
-    """What each way leaves: relative RMSE, fireflies, processor seconds, and the brightness that clamping takes."""
+    """For each way to render: relative RMSE, fireflies, processor seconds, and brightness relative to the converged
+    picture."""
     lightings = dict.fromkeys(way.lighting for way in WAYS.values())
     references = {
         lighting: render(bsdf, effort.noise_size, effort.reference_spp, Way(lighting, "multijitter"), seed=1)
@@ -154,7 +165,7 @@ def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str
     found = {}
     for label, way in WAYS.items():
         converged = references[way.lighting]
-        render(bsdf, effort.noise_size, 1, way)  # compiles
+        render(bsdf, effort.noise_size, 1, way)  # compile before the clock starts
         began = time.process_time()
         picture = render(bsdf, effort.noise_size, effort.noise_spp, way, seed=2)
         found[label] = {
@@ -168,7 +179,7 @@ def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str
 
 
 def fireflies(image: Image) -> NDArray[np.bool_]:
-    """Pixels (height, width) that are visibly brighter than the median of their 3 x 3 neighbourhood."""
+    """Marks the pixels (height, width) that are visibly brighter than the median of their 3 x 3 neighbourhood."""
     brightness = np.pad(image.mean(axis=2), 1, mode="edge")
     around = np.median(sliding_window_view(brightness, (3, 3)), axis=(2, 3))
     return brightness[1:-1, 1:-1] > np.maximum(FIREFLY * around, around + VISIBLE)

@@ -2,11 +2,12 @@
 
     python -m figures.library.run [--quick] [--steps N] [--data FILE] [--new FILE] [--held-out N] [--size N] [--spp N]
 
-Trains as `nma train-library` does, compares each material with its table, learns the codes of materials that training
-has not seen, and renders mixtures of four. The networks of NBRDF-MERL and a measured material are no part of this
-repository: `--data` and `--new` say where they are. Tables, weights and pictures are kept in out/figures/library, so a
-killed run goes on. Prints library.md and writes it, library.json and library.png beside this file; with --quick, of a
-few BSDFs of Mitsuba's and with little training, to out/figures/library.
+Trains a library as `nma train-library` does, and compares each of its materials with the material's table. Then it
+learns the codes of materials that training has not seen, and renders mixtures of four materials. The networks of
+NBRDF-MERL and a measured material are not part of this repository: `--data` and `--new` say where they are. Tables,
+weights and pictures are kept in out/figures/library, so a killed run continues where it stopped. Prints library.md, and
+writes library.md, library.json and library.png beside this file. With --quick, it takes a few of Mitsuba's BSDFs and
+little training, and writes to out/figures/library.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ from nma.train.recipe import Recipe
 DATA = common.DATA
 NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"
 NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
-# Top left, top right, bottom left, bottom right: a metal, a paint, a matte material and a plastic.
+# The materials at the top left, top right, bottom left and bottom right: a metal, a paint, a matte material, a plastic.
 CORNERS = ("brass", "color-changing-paint2", "pink-fabric", "green-plastic")
 CELLS = 7
-# Stops that brighten the sheet; FLIP is of the pictures as they are.
+# The sheet is brighter than the pictures by this many stops. FLIP is computed from the pictures themselves.
 EXPOSURE = 1.0
-# Cosines in each row of a table at which an adapter runs to be compared with it.
+# An adapter that is compared with a table runs at this many values of cos(theta_i) in each row of the table.
 DIRECTIONS = 16
 # Correlated multi-jittered samples, as in figures/rendered.
 SAMPLER = "multijitter"
@@ -90,15 +91,17 @@ def main() -> None:
 
 def parse() -> argparse.Namespace:
     parser = common.parser(__doc__)
-    parser.add_argument("--steps", type=int, help="of training, instead of the recipe's")
+    parser.add_argument("--steps", type=int, help="training steps, in place of the recipe's")
     parser.add_argument("--data", type=Path, default=NBRDF, help="the materials")
-    parser.add_argument("--new", type=Path, default=NEW, help="a material that is only encoded")
+    parser.add_argument("--new", type=Path, default=NEW, help="a material for which only a code is learned")
     parser.add_argument(
-        "--held-out", type=int, default=10, help="materials that a second library does not see"
+        "--held-out", type=int, default=10, help="how many materials to hide from a second library"
     )
-    parser.add_argument("--size", type=int, default=128, help="of the pictures, in pixels")
+    parser.add_argument("--size", type=int, default=128, help="size of the pictures, in pixels")
     parser.add_argument("--spp", type=int, default=256, help="samples per pixel of the mixtures")
-    parser.add_argument("--reference-spp", type=int, default=1024, help="of fits and references")
+    parser.add_argument(
+        "--reference-spp", type=int, default=1024, help="samples per pixel of fits and references"
+    )
     arguments = parser.parse_args()
     vars(arguments).update(settings={}, encoding_steps=training.ENCODING.steps, corners=CORNERS)
     if arguments.quick:
@@ -112,7 +115,7 @@ def parse() -> argparse.Namespace:
 
 
 def write_quick(kept: Path) -> None:
-    """A few of Mitsuba's BSDFs in files, four to train on and one that is new."""
+    """Writes five of Mitsuba's BSDFs to files: four to train on, and a new one."""
     for name, bsdf in QUICK.items():
         path = kept / ("new.xml" if name == "new" else f"materials/{name}.xml")
         write_text(path, bsdf.replace("<bsdf", '<bsdf version="3.0.0"') + "\n")
@@ -128,7 +131,7 @@ def tabulated(members: Sequence[Member], kept: Path) -> Tables:
 def trained(
     label: str, members: Sequence[Member], tables: Tables, recipe: Recipe, kept: Path
 ) -> tuple[Library, float]:
-    """The library of these materials, and the seconds that its training took."""
+    """Returns the library of these materials, trained unless its file exists, and the seconds of its training."""
     path = kept / f"{label}_{recipe.steps}.safetensors"
     if not path.exists():
         record = {"data": collection.origin(members), "materials": len(members)}
@@ -145,7 +148,7 @@ def trained(
 
 
 def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]:
-    """Log loss and albedo error of each material of the library, best first."""
+    """Log loss, albedo error and noise floor of each material of the library, sorted by log loss."""
     known = Tables(library.codes.astype(np.float64), tables.values, tables.walks, tables.error)
     found = common.kept(path, lambda: common.figures(library.adapter, known, DIRECTIONS))
     wanted = ("log_loss", "albedo_error", "noise_floor")
@@ -157,7 +160,7 @@ def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]
 
 
 def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[str, Any]:
-    """What a new material's code achieves."""
+    """Learns the code of a new material, and returns its log loss, the nearest known material and the seconds."""
     began = time.perf_counter()
     found = training.encode(library, tables, recipe=replace(training.ENCODING, steps=steps))
     row = {"name": name, "log_loss": round(found.log_loss, 6), "nearest": found.nearest}
@@ -169,7 +172,7 @@ def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[st
 def unseen(
     members: Sequence[Member], tables: Tables, recipe: Recipe, arguments: argparse.Namespace, kept: Path
 ) -> list[dict[str, Any]]:
-    """Codes of materials that a second library has not seen: evenly chosen ones."""
+    """Trains a second library without some materials, evenly chosen, and learns the codes of these materials."""
     if not arguments.held_out:
         return []
     out = np.linspace(0, len(members), arguments.held_out, endpoint=False).astype(int) + 1
@@ -185,7 +188,8 @@ def unseen(
 def rendered(
     library: Library, members: Sequence[Member], arguments: argparse.Namespace, kept: Path
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The grid of mixtures (CELLS, CELLS), references and fits of the corners; FLIP of each fit, and of noise alone."""
+    """Renders the CELLS x CELLS grid of mixtures and the references of its corners; returns these pictures, and for
+    each corner the FLIP of its fit and of noise alone."""
     by_name = {member.name: member for member in members}
     size, many = arguments.size, arguments.reference_spp
     codes = np.stack([library.code(name) for name in arguments.corners])
@@ -210,20 +214,20 @@ def rendered(
 
 
 def fit(library: Library, code: NDArray, kept: Path) -> dict[str, Any]:
-    """The BSDF of a code."""
+    """The BSDF `nma` for a code of the library."""
     path = kept / "mixture.safetensors"
     library.material(code).save(path)
     return {"type": "nma", "adapter": str(path)}
 
 
 def measured(member: Member) -> dict[str, Any]:
-    """The BSDF of a material itself."""
+    """The BSDF `values`, which renders a material itself."""
     chosen = {"material": member.material} if member.material else {}
     return {"type": "values", "file": str(member.path)} | chosen
 
 
 def markdown(data: dict[str, Any]) -> str:
-    """The tables of README.md."""
+    """The tables of README.md, in Markdown."""
     losses = [row["log_loss"] for row in data["fits"]]
     albedos = [row["albedo_error"] for row in data["fits"]]
     worst = data["fits"][-1]
@@ -257,7 +261,7 @@ def markdown(data: dict[str, Any]) -> str:
 
 
 def sheet(pictures: dict[str, Any], flips: list[dict[str, Any]], path: Path) -> None:
-    """The grid, with the references beside its corners, and towards the middle the FLIP of the fits."""
+    """Draws the grid. Beside each corner are the reference and, next to it, the FLIP of the fit."""
     figure = Figure(figsize=(1.4 * (CELLS + 2), 1.4 * CELLS))
     axes = figure.subplots(CELLS, CELLS + 2)
     figure.subplots_adjust(left=0.003, right=0.997, bottom=0.003, top=0.997, wspace=0.03, hspace=0.03)

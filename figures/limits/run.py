@@ -1,10 +1,11 @@
-"""What limits the class adapters: unseen materials, beside fits of several targets to each of them alone.
+"""What limits the class adapters: they are compared with fits of several targets to single, unseen materials.
 
     python -m figures.limits.run [--quick] [--materials N]
 
-A fit knows its material, so what it leaves is the target's error; what a class adapter leaves beyond a fit of its own
-target is the network's, the data's and the optimiser's. Each of the first materials of the set "range", which is in
-random order, is fitted to its reference and judged by it. Finished ones are kept in out/figures/limits.
+A fit is trained on its own material, so its remaining error is the error of the target. A class adapter with the same
+target has a larger error; the difference comes from the network, the data and the optimiser. The materials are the
+first ones of the set "range", which is in random order. Each is fitted to its reference and evaluated on the same
+reference. Finished materials are kept in out/figures/limits.
 Writes limits.json and limits.png beside this file; with --quick, short fits to two materials, to out/figures/limits.
 """
 
@@ -25,7 +26,7 @@ from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
 SET = "range"
-# Targets that are fitted; the first one is the class adapters'.
+# The targets that are fitted. The first is the target of the class adapters.
 TARGETS: dict[str, dict[str, Any]] = {
     "fit, two instances": {"target": "principled"},
     "fit, two stretched": {"target": "stretched"},
@@ -37,7 +38,7 @@ FIGURES = ("log_loss", "albedo_error")
 def main() -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--materials", type=int, default=6)
-    parser.add_argument("--steps", type=int, default=4000, help="of each fit")
+    parser.add_argument("--steps", type=int, default=4000, help="steps of each fit")
     arguments = parser.parse_args()
     if arguments.quick:
         vars(arguments).update(materials=2, steps=100)
@@ -52,14 +53,14 @@ def main() -> None:
 
 
 def contenders(reference: nma.Tables, number: int, arguments: Namespace) -> dict:
-    """Figures of the shipped adapters, of fits of all targets, and of the reference's noise, for a material."""
+    """The figures of one material, kept in a file: of the shipped adapters, the fits and the reference's noise."""
     stored = common.ROOT / "out/figures/limits" / f"{number}-{len(reference.params)}-{arguments.steps}.json"
     table = reference[number : number + 1]
     return common.kept(stored, partial(compete, number, table, arguments), arguments.quick)
 
 
 def compete(number: int, table: nma.Tables, arguments: Namespace) -> dict:
-    """`contenders`, worked out."""
+    """Computes the figures that `contenders` keeps."""
     row: dict = {"params": [round(float(x), 5) for x in table.params[0]]}
     for name in nma.shipped()[::-1]:
         row[name], row["noise"] = figures(nma.Adapter.load(name), table)
@@ -75,20 +76,20 @@ def fit(table: nma.Tables, recipe: Recipe) -> dict[str, float]:
 
 
 def figures(adapter: nma.Adapter, table: nma.Tables) -> tuple[dict[str, float], dict[str, float]]:
-    """The adapter's figures, and those of a perfect one."""
+    """The figures of the adapter, and the figures that a perfect adapter would have."""
     found = nma.evaluate_adapter(adapter, table).mean
     mine = {name: round(found[name], 6) for name in FIGURES}
     return mine, {"log_loss": round(found["noise_floor"], 6), "albedo_error": 0.0}
 
 
 def summary(rows: list[dict]) -> dict[str, dict[str, float]]:
-    """Means over the materials."""
+    """The means of all figures over the materials, by model."""
     names = [name for name in rows[0] if name != "params"]
     return {n: {f: round(float(np.mean([r[n][f] for r in rows])), 6) for f in FIGURES} for n in names}
 
 
 def plot(rows: list[dict], path: Path) -> None:
-    """The log loss of every contender for every material."""
+    """Draws the log loss of every model for every material."""
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     axes = figure.add_subplot(ylabel="log loss (eq. 7)", xlabel="materials, by the class adapter's log loss")
     for name in (name for name in rows[0] if name != "params"):

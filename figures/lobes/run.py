@@ -1,9 +1,9 @@
-"""Lobes of a layered material, fitted by one Principled BRDF and by a blend of two that follows wi (paper Fig. 2).
+"""Lobes of layered materials, fitted with one Principled BRDF and with a blend of two that follows wi (paper Fig. 2).
 
     python -m figures.lobes.run [--quick] [MATERIAL ...]
 
-Both targets are fitted to the same table of 64 M walks, and compared with an independent one of as many. Plotted are
-bin averages of f cos(theta_o) in the plane of incidence. Writes lobes.json and lobes.png beside this file; with
+Both targets are fitted to the same table of 64 M walks, and compared with an independent table of 64 M walks. The plot
+shows bin averages of f cos(theta_o) in the plane of incidence. Writes lobes.json and lobes.png beside this file; with
 --quick, one material, few walks and few steps, to out/figures/lobes.
 """
 
@@ -26,12 +26,12 @@ from nma.train.run import fit_material
 
 MATERIALS = ("copper-purple-medium", "beetle-green")
 ANGLES = (20, 50, 75)  # of wi, in degrees
-# The paper's targets: the 11 numbers of a Principled BRDF for each instance.
+# The paper's targets, with 11 numbers of the Principled BRDF for each instance.
 VARIANTS = {
     "single": {"instances": 1, "directional": False, "target": "principled"},
     "blended + ωi": {"instances": 2, "directional": True, "target": "principled"},
 }
-# The frame ends at so many times the value that the brightest bins but these reach.
+# The plot is cut off at CUT times the value of the PEAK_BINS-th brightest bin.
 CUT, PEAK_BINS = 4.0, 6
 COLOURS = ("#d62728", "#2ca02c", "#1f5fd0")
 
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def fit(name: str, quick: bool) -> Fit:
-    """Fits every variant to one table; the reference comes from another random stream."""
+    """Fits every variant to the same table, and compares it with a reference from an independent random stream."""
     source, vector = nma.source("layered3"), nma.load_material(name).vector()
     walks = 4_000_000 if quick else common.REFERENCE_WALKS
     seen = nma.tabulate(source, vector[None], walks, stream_keys(0, [0]), error=False)
@@ -79,22 +79,26 @@ def fit(name: str, quick: bool) -> Fit:
 
 
 def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
-    """Angles of wo [radians], positive on the mirror's side, and values (2 theta_o, 3) in the plane of incidence."""
+    """A slice of a table (theta_i, theta_o, phi, 3) in the plane of incidence, for an angle of wi in degrees.
+
+    Returns the angles of wo [radians], positive on the side of the mirror direction, and the values (2 theta_o, 3).
+    """
     bins = table.shape[1]
     theta = np.arccos((np.arange(bins) + 0.5) / bins)
     values = table[common.row(angle, len(table))].astype(np.float64)
-    # From grazing on the side of wi (delta_phi = 0) over the normal to grazing on the mirror's (delta_phi = pi).
+    # The slice runs from grazing on the side of wi (delta_phi = 0), through the normal, to grazing on the side of the
+    # mirror direction (delta_phi = pi).
     return np.concatenate([-theta, theta[::-1]]), np.concatenate([values[:, 0], values[::-1, -1]])
 
 
 def plane_errors(table: NDArray, reference: NDArray) -> dict[str, float]:
-    """Mean absolute error over the plotted bins, per angle [1/sr]."""
+    """The mean absolute error over the plotted bins [1/sr], for each angle."""
     errors = {a: np.abs(in_plane(table, a)[1] - in_plane(reference, a)[1]).mean() for a in ANGLES}
     return {f"{angle} degrees": round(float(error), 5) for angle, error in errors.items()}
 
 
 def plot(fits: dict[str, Fit], path: Path) -> None:
-    """A row for each material and variant, a column for each angle."""
+    """Draws the lobes: a row for each material and variant, a column for each angle."""
     rows = [(name, label) for name in fits for label in VARIANTS]
     figure = Figure(figsize=(11, 1.7 * len(rows) + 0.7), layout="constrained")
     axes = figure.subplots(len(rows), len(ANGLES), squeeze=False)
@@ -111,7 +115,8 @@ def plot(fits: dict[str, Fit], path: Path) -> None:
 
 
 def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
-    """One half disc. Radii are square roots, so that low lobes show, and reach as far for both variants."""
+    """Draws one half disc. Radii are square roots of the values, so that low lobes are visible. Both variants have the
+    same scale."""
     theta, reference = in_plane(fit.reference, angle)
     across, up = np.sin(theta)[:, None], np.cos(theta)[:, None]
     ours = in_plane(fit.tables[label], angle)[1]
@@ -119,7 +124,7 @@ def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
     for values, style in zip((reference, ours), styles, strict=True):
         for x, y, colour in zip((across * np.sqrt(values)).T, (up * np.sqrt(values)).T, COLOURS, strict=True):
             ax.plot(x, y, color=colour, **style)
-    # A sharp coat's peak, a few bins wide and far above the rest, would hide all else: it leaves the frame.
+    # The peak of a sharp coat is a few bins wide and far above everything else, so it is cut off.
     peak = max(in_plane(t, angle)[1].max() for t in (fit.reference, *fit.tables.values()))
     top = 1.05 * np.sqrt(min(peak, CUT * np.sort(reference.max(axis=1))[-PEAK_BINS]))
     scale(ax, top)
@@ -128,7 +133,7 @@ def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
 
 
 def scale(ax: Axes, top: float) -> None:
-    """The frame of a half disc of that radius, with rings at round values and rays every 30 degrees."""
+    """Draws the frame of a half disc of the radius `top`, with rings at round values and rays every 30 degrees."""
     half = np.linspace(-np.pi / 2, np.pi / 2, 181)
     rings = [t for t in (0.01, 0.05, 0.2, 1, 5, 20, 100) if 0.02 * top**2 < t < top**2]
     for radius in (top, *np.sqrt(rings)):

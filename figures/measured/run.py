@@ -1,12 +1,13 @@
-"""Single materials from any source: measured, analytic, isotropic or not, against the alternatives (paper Fig. 13).
+"""Fits to single materials, measured and analytic, isotropic and anisotropic, against other models (paper Fig. 13).
 
     python -m figures.measured.run [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
 
-Fits each material as `nma fit` does with a 3x32 network, and compares the fit with the material itself at 20,000 random
-pairs of directions and in a picture; beside it the best constant Principled BRDF, and for RGL's measurements the NBRDF
-network that its authors fitted to the same material. RGL's files and NBRDF's networks are no part of this repository:
-`--data` says where they are (folders `rgl` and `rgl_nbrdf`), without them they are left out. Writes measured.md,
-measured.json and measured.png beside this file; with --quick, with little training, to out/figures/measured.
+Fits a 3x32 network to each material, as `nma fit` does, and compares the fit with the material itself: at 20,000 random
+pairs of directions and in a picture. The best constant Principled BRDF is compared in the same way. So are, for RGL's
+measurements, the NBRDF networks that Sztrajman et al. 2021 fitted to them. RGL's files and the NBRDF networks are not
+part of this repository. `--data` names the folder that has them, in `rgl` and `rgl_nbrdf`; materials without a file are
+left out. Writes measured.md, measured.json and measured.png beside this file; with --quick and little training, to
+out/figures/measured.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from nma.train.fit import recipe_for
 
 DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")
-# What was published of NBRDF holds without the grazing directions in which measurements are hardest to follow.
+# Ranges of both cosines. NBRDF's published errors hold from .05 on: grazing measurements are hardest to fit.
 RANGES = {"": (0.02, 1.0), " from .05": (0.05, 1.0)}
 TIMED_PAIRS = 1 << 18
 SAMPLER = "multijitter"
@@ -64,7 +65,7 @@ BRUSHED = {
 
 
 class Material(NamedTuple):
-    """A source, the BSDF that renders it as it is, and the NBRDF network of the same material, if there is one."""
+    """A material's source, the BSDF that renders the source itself, and its NBRDF network, if there is one."""
 
     name: str
     source: Values
@@ -79,7 +80,7 @@ def main() -> None:
     nma.render.use()
     known = {m.name: m for m in materials(arguments.data)}
     if unknown := set(arguments.materials) - set(known):
-        sys.exit(f"no material {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+        sys.exit(f"no material {', '.join(sorted(unknown))}; the materials are {', '.join(known)}")
     chosen = [m for name, m in known.items() if not arguments.materials or name in arguments.materials]
     rows, pictures = [], []
     for material in chosen:
@@ -99,9 +100,9 @@ def main() -> None:
 def parse() -> argparse.Namespace:
     parser = common.parser(__doc__)
     parser.add_argument("materials", nargs="*")
-    parser.add_argument("--steps", type=int, help="of training, instead of the recipe's")
+    parser.add_argument("--steps", type=int, help="training steps, in place of the recipe's")
     parser.add_argument("--data", type=Path, default=DATA, help="folder with rgl and rgl_nbrdf")
-    parser.add_argument("--size", type=int, default=160, help="of the pictures, in pixels")
+    parser.add_argument("--size", type=int, default=160, help="size of the pictures, in pixels")
     parser.add_argument("--spp", type=int, default=1024, help="samples per pixel")
     arguments = parser.parse_args()
     arguments.constant_steps = CONSTANT.steps
@@ -113,7 +114,7 @@ def parse() -> argparse.Namespace:
 
 
 def materials(data: Path) -> list[Material]:
-    """RGL's where there are copies, then the analytic ones."""
+    """The materials: RGL's measurements whose files exist, then the analytic ones."""
     found = []
     for name in RGL:
         path, networks = data / f"rgl/{name}_rgb.bsdf", data / "rgl_nbrdf/rgl-isotropic_nbrdf_weights.npz"
@@ -124,7 +125,7 @@ def materials(data: Path) -> list[Material]:
             )
         else:
             print(
-                f"{name} is left out: there is no {path}; `nma data` says where it comes from",
+                f"{name} is left out, because {path} does not exist; `nma data` says where to get it",
                 file=sys.stderr,
             )
     coating = Coating(conductor="Au", alpha_metal=0.3, alpha=0.03, absorption=(0.02, 0.1, 0.3))
@@ -135,7 +136,7 @@ def materials(data: Path) -> list[Material]:
 
 
 def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, float]:
-    """The adapter as `nma fit` makes it, and the seconds that took, compilation included."""
+    """Returns the adapter that `nma fit` makes for the material, and the seconds of the fit, with compilation."""
     recipe = recipe_for(material.source, steps=steps)
     path = kept / f"{slug(material)}_{recipe.steps}.safetensors"
     if not path.exists():
@@ -151,7 +152,7 @@ def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, 
 def alternatives(
     material: Material, adapter: Adapter, constant_steps: int, kept: Path
 ) -> dict[str, tuple[Values, int]]:
-    """The fit and what it is compared with, each with its number of parameters."""
+    """The fit and the other models of the material, by name, each with its number of parameters."""
     found: dict[str, tuple[Values, int]] = {
         "3x32 fit": (AdapterValues(adapter), network.parameters(adapter.layers))
     }
@@ -160,7 +161,8 @@ def alternatives(
     if material.source.isotropic:
         path = kept / f"{slug(material)}_constant_{constant_steps}.safetensors"
         if not path.exists():
-            recipe = replace(CONSTANT, steps=constant_steps, albedo=0.0)  # as the results here were fitted
+            # The committed results were fitted without the albedo term.
+            recipe = replace(CONSTANT, steps=constant_steps, albedo=0.0)
             fit_constant(tabulate_values(material.source), recipe).adapter.save(path)
         constant = Adapter.load(path)
         found["constant Principled"] = AdapterValues(constant), constant.size
@@ -168,8 +170,8 @@ def alternatives(
 
 
 def judged(material: Material, models: dict[str, tuple[Values, int]]) -> list[dict[str, Any]]:
-    """Figures of each model against the material in each range of directions, its size, and its time per pair, all
-    models in turns."""
+    """Returns a row for each model: its number of parameters, its time per pair, and its figures against the material
+    in each range of directions."""
     times = nanoseconds([model for model, _ in models.values()])
     rows = []
     for (name, (model, parameters)), ns in zip(models.items(), times, strict=True):
@@ -186,7 +188,8 @@ def slug(material: Material) -> str:
 
 
 def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
-    """Best time of a pair of directions among many at once, on all cores, the models in turns, compilation apart."""
+    """The time of each model for a pair of directions: TIMED_PAIRS pairs at once on all cores, best of several
+    repetitions. The models take turns, and compilation is not counted."""
     rng = np.random.default_rng(0)
     lanes = [dr.auto.Float(rng.random(TIMED_PAIRS).astype(np.float32)) for _ in range(4)]
 
@@ -210,7 +213,8 @@ def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
 def rendered(
     material: Material, adapter: Adapter, kept: Path, arguments: argparse.Namespace
 ) -> tuple[list[Any], dict[str, float]]:
-    """The material, its fit and the map of their FLIP; and the FLIP of the fit, and of noise alone."""
+    """Renders the material twice and its fit once. Returns three pictures (the material, the fit and the map of their
+    FLIP), and the FLIP of the fit and of noise alone."""
     path = kept / f"{slug(material)}_rendered.safetensors"
     adapter.save(path)
     images = []
@@ -231,12 +235,12 @@ def rendered(
 
 
 def flip_picture(errors: np.ndarray) -> np.ndarray:
-    """A map of FLIP, 0 to 1, as bytes in the colours that its authors use."""
+    """A picture of a FLIP map (height, width), 0 .. 1: bytes (height, width, 3) in the colours of FLIP's authors."""
     return (colormaps["magma"](np.clip(errors, 0.0, 1.0))[..., :3] * 255.0).astype(np.uint8)
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The tables of README.md."""
+    """The tables of README.md, in Markdown."""
     lines = ["| material | model | log loss | AE | SMAPE | log loss from .05 | parameters | ns a pair |"]
     lines += ["|---|---|---|---|---|---|---|---|"]
     for row in rows:
@@ -257,7 +261,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def means(rows: list[dict[str, Any]]) -> list[str]:
-    """Mean log losses over the materials that have an NBRDF network, too."""
+    """Lines of a table with the mean log losses of each model; `rows` are the materials with an NBRDF network."""
     if not rows:
         return []
     lines = [

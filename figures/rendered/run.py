@@ -1,14 +1,14 @@
-"""Rendered error of the shipped adapters and of a single instance over samples per pixel (paper Table 2, last rows).
+"""Rendered error of the shipped adapters and of a single instance, over samples per pixel (paper Table 2, FLIP).
 
     python -m figures.rendered.run [--quick] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
         [--single WEIGHTS] [--only SUBJECT ...]
 
-Pictures of few samples differ from their reference by noise, whatever renders them. So every adapter, and the
-simulation once more, are compared with a converged simulation at ever more samples: the simulation's own curve tells
-how much of an adapter's is noise. Takes about two hours of one core; what is rendered is kept in
-out/figures/rendered, so a killed run goes on, and processes with different --only share the work.
-Prints the tables of README.md and writes rendered.json, rendered.png and materials.png beside this file; with --quick,
-of few small pictures, to out/figures/rendered.
+Every picture of few samples differs from its reference by noise. So the adapters are compared with a converged
+simulation at more and more samples per pixel. A second simulation is compared in the same way: its error is noise only,
+and shows how much of an adapter's error is noise. The script takes about two hours of one core. It keeps its pictures
+in out/figures/rendered, so a killed run continues where it stopped, and processes with different --only can share the
+work. Prints the tables of README.md and writes rendered.json, rendered.png and materials.png beside this file; with
+--quick, of few small pictures, to out/figures/rendered.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from nma.images.sheet import Row, contact_sheet
 from nma.render.load import material_bsdf
 
 SIMULATION, AGAIN, SINGLE = "reference", "simulation again", "single"
-# Of the paper's Table 2: blended + omega_i against single.
+# From the paper's Table 2: the FLIP of blended + omega_i, and its ratio to that of single.
 PAPER = {"flip_hdr": (0.0432, 0.89), "flip_ldr": (0.0352, 0.91)}
-# The single variant that figures/variants trains first.
+# The variant "single", as figures/variants trains it with its first seed.
 SINGLE_WEIGHTS = common.ROOT / "out/figures/variants/single_8000_6000-steps_seed-0.safetensors"
-# Correlated multi-jittered samples (Kensler 2013): at 64 samples a sixth of the adapters' variance of independent ones,
-# and two thirds of the simulation's.
+# Correlated multi-jittered samples (Kensler 2013). At 64 samples, they reduce the adapters' variance to a sixth of that
+# with independent samples, and the simulation's variance to two thirds.
 SAMPLER = "multijitter"
 FIRST_LEVEL = 64
-# Enough to see how the simulation's own noise falls.
+# The most samples of the second simulation; enough to see how its noise falls.
 AGAIN_SPP = 256
 ROWS = 4
 
 
 class Subject(NamedTuple):
-    """What renders the materials: an adapter's weights, or the simulation, with a seed of its own."""
+    """What renders the materials: an adapter with its weights, or the simulation (`weights` is None); and its seed."""
 
     name: str
     weights: Path | str | None
@@ -62,7 +62,8 @@ class Subject(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Names its pictures: other weights have other ones."""
+        """The start of its pictures' file names. It contains a hash of the weights, so new weights are rendered
+        again."""
         if self.weights is None:
             return f"layered_seed-{self.seed}"
         layers = nma.Adapter.load(self.weights).layers
@@ -88,12 +89,14 @@ def main() -> None:
 
 def parse() -> argparse.Namespace:
     parser = common.parser(__doc__)
-    parser.add_argument("--materials", type=int, default=89, help="of the set of 89, in its order")
-    parser.add_argument("--resolution", type=int, default=96, help="of the pictures, in pixels")
-    parser.add_argument("--spp", type=int, default=1024, help="most samples per pixel of the adapters")
+    parser.add_argument(
+        "--materials", type=int, default=89, help="how many of the 89 materials, from the first"
+    )
+    parser.add_argument("--resolution", type=int, default=96, help="size of the pictures, in pixels")
+    parser.add_argument("--spp", type=int, default=1024, help="the most samples per pixel of the adapters")
     parser.add_argument("--reference-spp", type=int, default=4096, help="samples per pixel of the simulation")
-    parser.add_argument("--single", type=Path, default=SINGLE_WEIGHTS, help="weights of a single instance")
-    parser.add_argument("--only", nargs="+", help="render these alone, and report nothing")
+    parser.add_argument("--single", type=Path, default=SINGLE_WEIGHTS, help="weights of the variant single")
+    parser.add_argument("--only", nargs="+", help="render only these, and report nothing")
     arguments = parser.parse_args()
     if arguments.quick:
         vars(arguments).update(materials=2, resolution=64, spp=128, reference_spp=128)
@@ -111,13 +114,13 @@ def subjects(arguments: argparse.Namespace) -> list[Subject]:
         found.append(Subject(SINGLE, arguments.single, spp, 3))
     elif not arguments.quick:
         sys.exit(
-            f"{arguments.single}: no such file; `python -m figures.variants.run --only single --seeds 1` makes it"
+            f"{arguments.single} does not exist; `python -m figures.variants.run --only single --seeds 1` makes it"
         )
     return found
 
 
 def levels(spp: int) -> list[int]:
-    """Samples per pixel at which pictures are kept: doubled up to `spp`."""
+    """The numbers of samples per pixel at which pictures are kept: FIRST_LEVEL, doubled until `spp`."""
     found = [min(FIRST_LEVEL, spp)]
     while found[-1] < spp:
         found.append(min(2 * found[-1], spp))
@@ -127,7 +130,7 @@ def levels(spp: int) -> list[int]:
 def gallery(
     subject: Subject, materials: list[nma.materials.Material], size: int, kept: Path
 ) -> list[NDArray[np.float32]]:
-    """The pictures (levels, size, size, 3) of each material, rendered where they are not there yet."""
+    """The pictures (levels, size, size, 3) of each material. Pictures without a file are rendered first."""
     found, bar = [], progress("materials/min")
     with bar:
         task = bar.add_task(subject.name, total=len(materials), rate="", note=f"{subject.spp} spp")
@@ -144,7 +147,7 @@ def gallery(
 
 
 def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
-    """The levels that a run of fewer samples has rendered."""
+    """The pictures of lower levels that an earlier run with fewer samples has rendered."""
     for spp in reversed(levels(subject.spp)[:-1]):
         shorter = path.with_name(path.name.replace(f"_{subject.spp}-spp_", f"_{spp}-spp_"))
         if shorter.exists():
@@ -155,8 +158,11 @@ def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
 def converge(
     subject: Subject, bsdf: dict[str, Any], size: int, found: list[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """Pictures (levels, size, size, 3) of ever more samples, each made of those of the one before and new ones; the
-    first levels may have been `found` already."""
+    """Pictures (levels, size, size, 3) of more and more samples. Each level reuses the samples of the level before.
+
+    Args:
+        found: the pictures of the first levels, if an earlier run has rendered them.
+    """
     steps = levels(subject.spp)
     before = steps[len(found) - 1] if found else 0
     total = before * found[-1].astype(np.float64) if found else np.zeros((size, size, 3))
@@ -174,7 +180,7 @@ def report(
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
-    """Prints and writes figures, tables, plot and pictures."""
+    """Compares the pictures, prints the tables, and writes figures, tables, plot and sheet."""
     references = [levels_of_it[-1] for levels_of_it in pictures[SIMULATION]]
     steps = levels(arguments.spp)
     errors = {
@@ -215,7 +221,7 @@ def mean(rows: list[dict[str, float]], metric: str) -> float:
 
 
 def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.Namespace) -> str:
-    """All metrics at the most samples, then FLIP over samples."""
+    """The tables in Markdown: all metrics at the most samples per pixel, then FLIP over samples per pixel."""
     most = arguments.spp
     lines = [
         f"{arguments.materials} materials, {arguments.resolution} x {arguments.resolution} pixels; reference:"
@@ -246,7 +252,7 @@ def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.
 
 
 def plot(means: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
-    """FLIP over samples, with the paper's values as lines."""
+    """Draws FLIP over samples per pixel, with the paper's values as lines."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     for axes, (metric, (paper, _)) in zip(figure.subplots(1, 2), PAPER.items(), strict=True):
         for name, by_spp in means.items():
@@ -265,7 +271,7 @@ def sheet(
     materials: list[nma.materials.Material],
     path: Path,
 ) -> None:
-    """Materials at even steps of the best adapter's HDR-FLIP, from the worst to the median."""
+    """Writes a sheet of pictures of ROWS materials, from the worst to the median by the best adapter's HDR-FLIP."""
     shown = [name for name in flips if name != AGAIN]
     best = nma.shipped()[-1]
     chosen = studio.worst_to_median(flips[best]["flip_hdr"], ROWS)

@@ -1,4 +1,4 @@
-"""Model cards of the shipped adapters: what they are, how good, and where they fail, with pictures."""
+"""Writes the model cards of the shipped adapters: what they are, how good they are, and where they fail."""
 
 from __future__ import annotations
 
@@ -21,16 +21,23 @@ from nma.render.progressive import render_passes
 
 WORST = 10
 LIMITS = """\
-- Only the class `layered3` within its training range: anything beyond is refused, or moved to the range where asked to.
-- The target follows the view direction, so it is not reciprocal: light tracing and bidirectional methods converge to
-  another picture.
-- Isotropic reflection only; lobes have the shapes of the Principled BRDF's. What those cannot show stays: see the worst
-  materials.
+- The adapter knows only the class `layered3` within its training range. It refuses other parameters, or clamps them to
+  the range on request.
+- The target follows the view direction, so it is not reciprocal. Light tracing and bidirectional methods converge to
+  another picture, unless they [prepare the blend for the camera's side](../../docs/mitsuba.md#reciprocity).
+- Reflection is isotropic, and its lobes have the shapes of the Principled BRDF. The worst materials show the errors
+  that this causes.
 """
 
 
 def write(weights: str, sets: dict[str, tuple[nma.Tables, dict]], folder: Path, quick: bool) -> Path:
-    """The card of one adapter, with its pictures; `sets` has the reference tables and the results of each set."""
+    """Writes the card of one adapter with its pictures, and returns the card's path.
+
+    Args:
+        weights: a weights file or a shipped name.
+        sets: the reference tables and the results of each set, by name.
+        quick: whether to render few small pictures.
+    """
     adapter, name = nma.Adapter.load(weights), Path(weights).stem
     _histogram(sets, folder / f"{name}-errors.png")
     captions = _worst(weights, sets, folder / f"{name}-worst.png", quick)
@@ -45,18 +52,19 @@ def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dic
     bound = "bounded" if adapter.bounded else "not bounded"
     return f"""# {name}
 
-Written by `python -m figures.shipped.run`. An adapter for the class `{adapter.space.name}`: {adapter.variant}, a
-network {recipe["network"]} of {count:,} numbers, encoding `{adapter.encoding}`, energy {bound}.
+Written by `python -m figures.shipped.run`. This is an adapter for the class `{adapter.space.name}`. Its target is
+{adapter.variant}, energy {bound}. Its network is {recipe["network"]} with {count:,} parameters, encoding
+`{adapter.encoding}`.
 
 ## Training
-{data["materials"]:,} materials with {data["walks"]:,} walks each (seed {data["seed"]}), population
-`{data["population"]}`; {record["steps"]:,} steps over {record["bins_seen"]:,} bins in {record["seconds"] / 60:.0f}
-minutes on {record["device"]} ({record["date"]}). The commands stand in [docs/training.md](../../docs/training.md),
-every setting in `nma info {name}`.
+The dataset has {data["materials"]:,} materials of the population `{data["population"]}`, with {data["walks"]:,} walks
+each (seed {data["seed"]}). Training took {record["steps"]:,} steps over {record["bins_seen"]:,} bins, or
+{record["seconds"] / 60:.0f} minutes on {record["device"]} ({record["date"]}).
+[docs/training.md](../../docs/training.md) has the commands, and `nma info {name}` prints every setting.
 
 ## Figures on materials it has not seen
-What each means: [docs/evaluation.md](../../docs/evaluation.md). In `metals` every third material's metal was held out
-of training.
+[docs/evaluation.md](../../docs/evaluation.md) explains the figures. In the set `metals`, every third material has a
+metal that was held out of training.
 
 {_table(sets)}
 
@@ -72,7 +80,7 @@ of training.
 
 
 def _table(sets: dict[str, tuple[nma.Tables, dict]]) -> str:
-    """The mean figures as rows, one column per set, then the worst ones."""
+    """A table with a column for each set: first the mean figures, then the worst figures."""
     rows = [("figure", *(f"{label}, {len(tables.params)}" for label, (tables, _) in sets.items()))]
     rows.append(("---",) * len(rows[0]))
     rows += [
@@ -97,7 +105,7 @@ def _histogram(sets: dict[str, tuple[nma.Tables, dict]], path: Path) -> None:
 
 
 def _worst(weights: str, sets: dict[str, tuple[nma.Tables, dict]], path: Path, quick: bool) -> list[str]:
-    """Renders the materials of the largest log loss; returns a line about each."""
+    """Renders the materials with the largest log losses, and returns a line about each of them."""
     nma.render.use()
     ranked = [
         (loss, label, k) for label, (_, result) in sets.items() for k, loss in enumerate(result["log_loss"])

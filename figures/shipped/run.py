@@ -1,10 +1,10 @@
-"""The shipped adapters on materials they have not seen: 89 from Table 1's ranges, 60 with real metals.
+"""The shipped adapters on materials that training has not seen: 89 from Table 1's ranges, and 60 with real metals.
 
     python -m figures.shipped.run [--quick] [--adapter FILE ...]
 
-Every third of the 60 has a metal that training never saw. References of 64 M walks per material are simulated once,
-from the seeds below, into out/references (about 15 minutes on 2 cores; a killed run resumes). Writes shipped.json,
-shipped.png and a model card for each adapter beside this file; with --quick, few materials and walks, to
+Every third of the 60 has a metal that training never saw. The references have 64 M walks per material. They are
+simulated once, from fixed seeds, into out/references (about 15 minutes on 2 cores; a killed run resumes). Writes
+shipped.json, shipped.png and a model card for each adapter beside this file; with --quick, few materials and walks, to
 out/figures/shipped.
 """
 
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def summary(evaluation, tables) -> dict:
-    """Means, the figures of sharp coats and of held-out metals, and every material's two main figures."""
+    """The mean figures, the figures of sharp coats, the worst figures, and both main figures of every material."""
     rounded = {k: round(v, 6) for k, v in evaluation.mean.items()}
     errors = np.array([m["albedo_error"] for m in evaluation.materials])
     sharp = tables.params[:, nma.LAYERED3.slices["alpha_top"]][:, 0] < 0.01
@@ -59,7 +59,7 @@ def summary(evaluation, tables) -> dict:
 
 
 def plot(results: dict, path: Path) -> None:
-    """Sorted log loss and albedo error of every material, one curve per adapter and set."""
+    """Draws the sorted log losses and albedo errors of all materials, one curve for each adapter and set."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots(1, 2)
     for label, sets in results.items():

@@ -1,8 +1,8 @@
-"""BSDF slices at 70 degrees and at normal incidence, of six unseen materials and of their adapter (paper Fig. 10).
+"""BSDF slices of six unseen materials and of their adapter, at 70 degrees and at normal incidence (paper Fig. 10).
 
     python -m figures.slices.run [--quick] [--adapter FILE]
 
-The materials are taken from the reference set "range" by the roughness of their coats, evenly from sharp to rough.
+The materials are from the reference set "range", evenly spaced by the roughness of their coats, from sharp to rough.
 Writes slices.json and slices.png beside this file; with --quick, four materials with few walks, to out/figures/slices.
 """
 
@@ -22,9 +22,9 @@ from nma.images.io import tonemap
 MATERIALS = 6
 ANGLES = (70, 0)  # of wi, in degrees
 PIXELS = 256
-# Shown is y / (1 + y) of so many times the value.
+# A value f is shown as y / (1 + y), with y = EXPOSURE f.
 EXPOSURE = 3.0
-# Absolute error that takes the last colour, in 1/sr.
+# The absolute error [1/sr] that gets the last colour of the scale.
 ERROR_SCALE = 0.5
 
 
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def chosen(tables: nma.Tables) -> nma.Tables:
-    """Evenly spaced in the order of the coats' roughness, so that no result has a say in the choice."""
+    """Chooses materials, evenly spaced by the roughness of their coats. The choice does not depend on results."""
     order = np.argsort(tables.params[:, nma.LAYERED3.slices["alpha_top"]][:, 0])
     count = min(MATERIALS, len(order))
     picked = order[((np.arange(count) + 0.5) / count * len(order)).astype(int)]
@@ -49,7 +49,7 @@ def chosen(tables: nma.Tables) -> nma.Tables:
 
 
 def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
-    """Mean absolute errors per slice [1/sr] next to the slice's mean, and what the reference's noise adds to them."""
+    """For each slice [1/sr]: the mean absolute error, the mean value, and the error that noise alone would make."""
     slices = []
     for m, params in enumerate(tables.params):
         entry: dict = {"params": [round(float(x), 5) for x in params]}
@@ -61,7 +61,7 @@ def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
                 "mean": reference.mean(),
             }
             if tables.error is not None:
-                # Mean of |e| for a normal e.
+                # The mean of |e| for a normally distributed e.
                 figures["of_noise_alone"] = np.sqrt(2 / np.pi) * tables.error[at].mean(dtype=np.float64)
             entry[f"{angle} degrees"] = {name: round(float(x), 6) for name, x in figures.items()}
         slices.append(entry)
@@ -75,11 +75,18 @@ def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
 
 
 def disc(values: NDArray, outside: float = 1.0) -> NDArray[np.float32]:
-    """The hemisphere of wo (theta_o, phi, channels) seen from above: wi to the left, its mirror direction to the right.
+    """Draws the hemisphere of wo from above, with wi to the left and its mirror direction to the right.
 
-    Lambert's equal-area projection: every bin takes up as much of the disc as of the hemisphere.
+    The projection is Lambert's: all bins have equal areas on the disc, as on the hemisphere.
+
+    Args:
+        values: (theta_o, phi, channels).
+        outside: the value of pixels beside the disc.
+
+    Returns:
+        a picture (PIXELS, PIXELS, channels).
     """
-    # Pixels are averages of 2 x 2, which softens the rim.
+    # Each pixel is the average of 2 x 2 samples, which makes the rim smooth.
     axis = (np.arange(2 * PIXELS) + 0.5) / PIXELS - 1.0
     x, y = np.meshgrid(axis, axis)
     cosine = 1.0 - x * x - y * y
@@ -92,7 +99,7 @@ def disc(values: NDArray, outside: float = 1.0) -> NDArray[np.float32]:
 
 
 def plot(tables: nma.Tables, adapter: NDArray, label: str, path: Path) -> None:
-    """Materials in columns; for each angle a row of references, of the adapter and of absolute errors."""
+    """Draws a column for each material. Each angle has three rows: reference, adapter and absolute error."""
     count = len(tables.params)
     figure = Figure(figsize=(1.5 * count + 1.3, 9.6), layout="constrained")
     axes = figure.subplots(3 * len(ANGLES), count, squeeze=False)

@@ -1,11 +1,12 @@
-"""Paper Fig. 5: what a fit learns from the centre of a bin, from 1 to 20 points in it, and from points that crowd.
+"""Paper Fig. 5: fits that learn from the centre of a bin, from 1 to 20 uniform points in it, and from crowded points.
 
     python -m figures.supervision.run [--quick]
 
-A 3x32 network that sees the view direction alone is fitted to a smooth conductor and to a layered material, always with
-the paper's loss and target, the same table, steps and learning rate; only the points that stand for a bin differ. The
-last column adds what else `nma fit` does. Every fit is compared with an independent table and rendered. Writes
-supervision.json and supervision.png beside this file; with --quick, three short fits, to out/figures/supervision.
+Training compares a bin's value with the target at one or more points in the bin. Here a 3x32 network, which sees only
+the view direction, is fitted to a smooth conductor and to a layered material. All fits use the paper's loss and target
+and the same table, steps and learning rate; only the points differ. The last column also has the other settings of
+`nma fit`. Every fit is compared with an independent table and rendered. Writes supervision.json and supervision.png
+beside this file; with --quick, three short fits, to out/figures/supervision.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from nma.table import stream_keys
 from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
-# The paper's conductor lies bare; this class has a coat, so we make it smooth and almost index-matched.
+# The paper's conductor is bare. Materials of our class have a coat, so ours is smooth and has an index close to 1.
 BARE = {"alpha_top": 0.001, "alpha_bottom": 0.01, "eta_top": 1.05, "albedo": 1.0, "sigma_t": 0.0}
 LAYERED = "gold-red-lacquer"
 PAPER = {"loss": "log", "energy": 0.0, "albedo": 0.0, "target": "principled", "bins_law": "uniform"}
@@ -36,7 +37,7 @@ REFERENCE_KEY = 999
 
 
 class Effort(NamedTuple):
-    """How much of everything."""
+    """The sizes of the experiment: steps, walks, pixels on a side and samples per pixel."""
 
     steps: int = 3000
     walks: int = 32_000_000
@@ -66,7 +67,7 @@ def main() -> None:
 
 
 def recipes(steps: int, quick: bool) -> dict[str, Recipe]:
-    """The columns of the picture."""
+    """The recipe of each column of the picture, by name."""
     equal = {"steps": steps, "schedule": "onecycle"}
     laws = {"centre": preset("single", **PAPER, **equal, points_law="centre", points=1)}
     for points in (8,) if quick else (1, 2, 4, 8, 20):
@@ -86,7 +87,7 @@ def materials() -> list[Material]:
 
 
 def compare(material: Material, laws: dict[str, Recipe], effort: Effort) -> tuple[dict[str, dict], Row]:
-    """The figures of each fit to one material, and their row of pictures."""
+    """Fits one material with each recipe; returns the figures of each fit and a row of pictures."""
     source, params = nma.source(material.class_name), material.vector()[None]
     tables = nma.tabulate(source, params, effort.walks, stream_keys(0, [0]), error=False)
     truth = nma.tabulate(source, params, effort.reference_walks, stream_keys(REFERENCE_KEY, [0]))
@@ -110,7 +111,7 @@ def compare(material: Material, laws: dict[str, Recipe], effort: Effort) -> tupl
 
 
 def render_adapter(material: Material, adapter: nma.Adapter, effort: Effort) -> NDArray[np.float32]:
-    """The shader ball by the BSDF `nma`, which reads its weights from a file."""
+    """Renders the shader ball with the BSDF `nma`. The BSDF reads its weights from a file, so they are saved first."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "fit.safetensors"
         adapter.save(path)
@@ -118,7 +119,7 @@ def render_adapter(material: Material, adapter: nma.Adapter, effort: Effort) -> 
 
 
 def render(bsdf: dict, effort: Effort, spp: int) -> NDArray[np.float32]:
-    """The preview scene around a BSDF."""
+    """Renders the preview scene, outdoors, with this BSDF; returns a picture (size, size, 3)."""
     scene = nma.preview_scene(bsdf, size=(effort.size, effort.size), lighting="outdoors")
     return render_passes(load_dict(scene), spp)
 
@@ -128,7 +129,7 @@ def caption(figures: dict[str, float]) -> str:
 
 
 def note(effort: Effort) -> str:
-    """How the pictures came about."""
+    """A note below the pictures about how they were made."""
     return (
         f"Every fit: {effort.steps} steps on one table of {effort.walks / 1e6:.0f} M walks. Log loss and albedo error "
         f"against another table of {effort.reference_walks / 1e6:.0f} M walks.\n"

@@ -1,11 +1,12 @@
-"""Layered textures, zero-shot: roughness, extinction and albedo come from textures, one after the other (paper Fig. 7).
+"""Textures without training for them: roughness, then extinction, then albedo come from textures (paper Fig. 7).
 
     python -m figures.textures.run [--quick] [--adapter FILE]
 
-Reference and adapter render the preview scene around one material: (a) without textures, (b) with a texture for the
-metal's roughness, (c) also for the extinction, (d) also for the albedo of the medium. The reference is rendered once
-more with as many samples as the adapter: its error is that of noise alone. Writes textures.json and textures.png beside
-this file; with --quick, (a) and (d) alone, small and with few samples, to out/figures/textures.
+The simulation and the adapter render the preview scene with one material: (a) without textures, (b) with a texture for
+the metal's roughness, (c) also with one for the extinction, (d) also with one for the albedo of the medium. The
+simulation is rendered again with as many samples as the adapter; the error of this picture is noise only. Writes
+textures.json and textures.png beside this file; with --quick, only (a) and (d), in small pictures of few samples, to
+out/figures/textures.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ TABLED = ("flip_hdr", "flip_ldr", "smape", "ssim")
 
 
 class Size(NamedTuple):
-    """Pixels on a side, and samples per pixel of the reference and of what is compared with it."""
+    """Pixels on a side, samples per pixel of the reference, and samples per pixel of the other pictures."""
 
     pixels: int
     reference_spp: int
@@ -78,7 +79,8 @@ def main() -> None:
 
 
 def render(textures: dict[str, Any], adapter: str, size: Size) -> Step:
-    """The material with these textures, simulated and by its adapter; streams of samples are independent."""
+    """Renders the material with these textures: the reference, the simulation again, and the adapter. The three
+    pictures have independent samples."""
     material = nma.load_material(MATERIAL).changed(CHANGES)
     layered, ours = (
         load_dict(
@@ -112,7 +114,7 @@ def summary(steps: dict[str, Step], adapter: str, size: Size) -> dict:
 
 
 def plot(steps: dict[str, Step], adapter: str, size: Size, path: Path) -> None:
-    """One column per step: reference, adapter, and FLIP between them; their metrics below."""
+    """Draws one column for each step: the reference, the adapter and their FLIP. A table below has the metrics."""
     made = list(steps.values())
     differences = [difference_image(s.adapter, s.reference, kind="flip", scale=FLIP_SCALE) for s in made]
     rows = [

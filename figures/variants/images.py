@@ -1,4 +1,4 @@
-"""Shader balls of validation materials: rendered once, kept, and compared with the simulation."""
+"""Renders shader balls of the validation materials, keeps the pictures, and compares them with the simulation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nma.materials import Material
 from nma.render.load import material_bsdf
 
 Images = NDArray[np.float32]
-# Seeds of the renderings: the references' own, and that of the second one, which shows what noise alone scores.
+# Seeds of the reference, of a second simulation that shows what noise alone scores, and of the adapters.
 REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
 
 
@@ -41,7 +41,8 @@ class Gallery:
         self.reference = self._simulated(view.reference_spp, REFERENCE_SEED)
 
     def noise(self) -> dict[str, float]:
-        """What the reference scores against itself, rendered like an adapter: the best that can be had."""
+        """The metrics of a second simulation with the adapters' samples per pixel. They come from noise alone, so no
+        adapter can be expected to be better."""
         return compare(self._simulated(self._view.spp, NOISE_SEED), self.reference)
 
     def metrics(self, job: Job, adapter: nma.Adapter) -> dict[str, float]:
@@ -52,7 +53,7 @@ class Gallery:
         )
 
     def pictures(self, job: Job, adapter: nma.Adapter) -> Images:
-        """The adapter's pictures, rendered again where its weights are newer."""
+        """The adapter's pictures. They are rendered again if the weights are newer than the pictures."""
         weights = self._store.weights(job)
 
         def bsdf(material: Material) -> dict[str, Any]:
@@ -61,7 +62,7 @@ class Gallery:
         return self._kept(job.stem, bsdf, self._view.spp, ADAPTER_SEED, newer_than=weights)
 
     def shipped(self, name: str) -> dict[str, float]:
-        """The image metrics of a shipped adapter, which has seen the same data for many more steps."""
+        """The image metrics of a shipped adapter. It was trained on the same data for many more steps."""
         pictures = self._kept(
             name, lambda m: material_bsdf(m, "nma", adapter=name), self._view.spp, ADAPTER_SEED
         )
@@ -96,7 +97,7 @@ def compare(pictures: Images, references: Images) -> dict[str, float]:
 
 
 def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int = 4) -> None:
-    """Like the paper's Fig. 6: materials at even steps of the first variant's error, from the worst to the median."""
+    """Writes a sheet like the paper's Fig. 6: materials from the worst to the median by the first variant's error."""
     flips = {
         name: [nma.compare_images(a, b)["flip_ldr"] for a, b in zip(images, gallery.reference, strict=True)]
         for name, images in pictures.items()

@@ -1,4 +1,4 @@
-"""What the trainings say: means and deviations over seeds, orderings, tables in Markdown and the plot of Fig. 3."""
+"""The results of all trainings: means and deviations over seeds, orderings, Markdown tables and the plot of Fig. 3."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ ROWS_3 = {"omega_i": "1 instance", BEST: "2 instances"} | {name: name for name i
 
 
 def statistics(values: list[float]) -> dict[str, Any]:
-    """Mean and sample deviation; the latter is None for a single seed."""
+    """The mean, the standard deviation (None for a single seed) and the number of seeds."""
     deviation = round(float(np.std(values, ddof=1)), 7) if len(values) > 1 else None
     return {"mean": round(float(np.mean(values)), 7), "std": deviation, "seeds": len(values)}
 
 
 def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
-    """Everything that the tables show, by variant."""
+    """All results that the tables show: log losses by variant and size, orderings, and image metrics by variant."""
     losses: dict[str, dict[str, Any]] = {}
     for name in [*VARIANTS, *INSTANCES]:
         for size in [*sizes, 0]:
@@ -45,7 +45,7 @@ def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
 
 
 def orderings(results: Results, sizes: list[int]) -> dict[str, dict[str, list[bool]]]:
-    """By figure: whether single is worst and blended + omega_i best, for each seed that has all variants."""
+    """For each figure: whether single is worst and blended + omega_i is best, for each seed that has all variants."""
     found: dict[str, dict[str, list[bool]]] = {}
     for size in sizes:
         for seed in sorted({job.seed for job in results}):
@@ -66,18 +66,18 @@ def orderings(results: Results, sizes: list[int]) -> dict[str, dict[str, list[bo
 
 
 def _errors(runs: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """By figure, each variant's error: the log loss, and the image metrics if all variants have them."""
+    """The error of each variant, by figure: the log loss, and the image metrics if all variants have them."""
     found = {"log loss": {name: run["tables"]["log_loss"] for name, run in runs.items()}}
     if all("images" in run for run in runs.values()):
         for metric in METRICS:
-            # SSIM is a similarity.
+            # SSIM is a similarity: a high value is good, so its sign is changed.
             sign = -1.0 if metric == "ssim" else 1.0
             found[metric] = {name: sign * run["images"][metric] for name, run in runs.items()}
     return found
 
 
 def markdown(found: dict[str, Any], noise: dict[str, float], floor: float) -> str:
-    """All tables."""
+    """All tables, in Markdown, with headings."""
     parts = ["## Log loss (Fig. 3)", loss_table(found["log_loss"]), f"Noise of the references: {floor:.5f}."]
     parts += ["## Ordering", ordering_lines(found["ordering"])]
     for title, names, paper in (
@@ -97,7 +97,7 @@ def loss_table(losses: dict[str, dict[str, Any]]) -> str:
 
 
 def ordering_lines(found: dict[str, dict[str, list[bool]]]) -> str:
-    """In how many seeds the paper's ordering holds."""
+    """A table that says for how many seeds the paper's ordering holds."""
     if not found:
         return "No size has all variants yet."
     lines = [["", *next(iter(found.values()))]]
@@ -113,7 +113,8 @@ def ordering_lines(found: dict[str, dict[str, list[bool]]]) -> str:
 def image_table(
     images: dict[str, Any], names: dict[str, str], paper: dict[str, dict[str, float]], noise: dict[str, float]
 ) -> str:
-    """Ours above the paper's, MAPE and SMAPE in percent; last the noise of the renderings."""
+    """A table of image metrics: for each variant our row and the paper's, and last the noise of the renderings. MAPE
+    and SMAPE are in percent."""
     lines = [["", *(f"{m}, %" if m in PERCENT else m for m in METRICS)]]
     for variant, label in names.items():
         if variant in images:
@@ -139,7 +140,7 @@ def table(lines: list[list[str]]) -> str:
 
 
 def plot(losses: dict[str, dict[str, Any]], floor: float, path: Path) -> None:
-    """The paper's Fig. 3: log loss over the dataset's size, dashed the bound by overfitting."""
+    """Draws the paper's Fig. 3: log loss over the dataset's size. Dashed lines show the bounds by overfitting."""
     figure = Figure(figsize=(8.5, 4.5), layout="constrained")
     axes = figure.add_subplot(xlabel="materials in the training set", ylabel="validation log loss (eq. 7)")
     sizes: list[int] = []

@@ -1,13 +1,13 @@
-"""Paper Fig. 3, Table 2, Fig. 6 and Table 3: the target's variants over the size of the dataset, and in pictures.
+"""Paper Fig. 3, Table 2, Fig. 6 and Table 3: variants of the target, over the size of the dataset and in pictures.
 
     python -m figures.variants.run [--quick] [--data FOLDER.zarr] [--sizes N ...] [--seeds N] [--steps N]
         [--only VARIANT ...] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
 
-Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md), and on the validation
-set itself for the bounds. Takes hours: adapters, their figures and pictures are kept in out/figures/variants, so a
-killed run goes on, and nothing is done twice. With --only, only those variants are trained, and everything that is
-there is reported. Writes variants.json, tables.md, variants.png and materials.png beside this file; with --quick, of
-a few small trainings, to out/figures/variants.
+Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md). As a bound, it also
+trains every variant on the validation set itself. This takes hours. Adapters, their figures and their pictures are kept
+in out/figures/variants, so a killed run continues where it stopped, and nothing is done twice. --only limits the
+training to some variants; the report contains all adapters that exist. Writes variants.json, tables.md, variants.png
+and materials.png beside this file; with --quick, of a few small trainings, to out/figures/variants.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from nma.files import write_text
 
 SET = "range"
 SETTINGS = ("sizes", "seeds", "steps", "materials", "resolution", "spp", "reference_spp")
-# What --quick takes instead: materials and walks of its dataset, and its other settings.
+# Settings of --quick: materials and walks of its dataset, validation materials, and values for the other options.
 QUICK_DATA = (16, 100_000)
 QUICK_VALIDATION = 2
 QUICK = {"sizes": [16], "seeds": 1, "steps": 20, "materials": 2, "resolution": 160, "spp": 8}
@@ -42,7 +42,7 @@ def main() -> None:
     data = quick_dataset(kept / "data.zarr") if quick else arguments.data
     validation = common.reference(SET, quick)
     if quick:
-        # Compiling takes longer than these few steps.
+        # Optimised compilation takes longer than these few steps.
         jax.config.update("jax_disable_most_optimizations", True)
         validation = validation[:QUICK_VALIDATION]
     name = f"{SET}-{len(validation.params)}x{int(validation.walks[0])}"
@@ -56,7 +56,7 @@ def main() -> None:
         if adapter is not None:
             done[job], results[job] = adapter, {"tables": store.log_losses(job, adapter)}
     if not done:
-        sys.exit("nothing is trained yet")
+        sys.exit(f"{kept} has no trained adapters for these options; run again without --only to train them")
 
     nma.render.use()
     view = View(arguments.materials, arguments.resolution, arguments.spp, arguments.reference_spp)
@@ -70,14 +70,22 @@ def main() -> None:
 def parse() -> argparse.Namespace:
     parser = common.parser(__doc__)
     parser.add_argument("--data", type=Path, default=common.ROOT / "out/layered3.zarr", help="a dataset")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[250, 1000, 8000], help="materials")
-    parser.add_argument("--seeds", type=int, default=3, help="how many trainings of each kind")
-    parser.add_argument("--steps", type=int, default=6_000, help="of each training")
-    parser.add_argument("--only", nargs="+", choices=list(ALL), default=list(ALL), help="train only these")
-    parser.add_argument("--materials", type=int, default=View().materials, help="to render")
-    parser.add_argument("--resolution", type=int, default=View().size, help="of the pictures, in pixels")
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=[250, 1000, 8000], help="numbers of training materials"
+    )
+    parser.add_argument("--seeds", type=int, default=3, help="how many seeds for each training")
+    parser.add_argument("--steps", type=int, default=6_000, help="steps of each training")
+    parser.add_argument(
+        "--only", nargs="+", choices=list(ALL), default=list(ALL), help="train only these variants"
+    )
+    parser.add_argument(
+        "--materials", type=int, default=View().materials, help="how many materials to render"
+    )
+    parser.add_argument("--resolution", type=int, default=View().size, help="size of the pictures, in pixels")
     parser.add_argument("--spp", type=int, default=View().spp, help="samples per pixel of the adapters")
-    parser.add_argument("--reference-spp", type=int, default=View().reference_spp, help="of the simulation")
+    parser.add_argument(
+        "--reference-spp", type=int, default=View().reference_spp, help="samples per pixel of the simulation"
+    )
     arguments = parser.parse_args()
     if arguments.quick:
         vars(arguments).update(QUICK, reference_spp=64)
@@ -85,7 +93,7 @@ def parse() -> argparse.Namespace:
 
 
 def quick_dataset(path: Path) -> Path:
-    """A small dataset, simulated once."""
+    """Simulates a small dataset unless it exists, and returns its path."""
     materials, walks = QUICK_DATA
     nma.Dataset.create(path, nma.Settings("layered3", materials, walks, seed=2)).write()
     return path
@@ -98,7 +106,7 @@ def write(
     arguments: argparse.Namespace,
     done: dict[Job, nma.Adapter],
 ) -> None:
-    """Prints and writes tables, plot and pictures."""
+    """Prints the tables, and writes tables, figures, plot and pictures."""
     floor = next(iter(results.values()))["tables"]["noise_floor"]
     noise = gallery.noise()
     found = report.summary(results, arguments.sizes)

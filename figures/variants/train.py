@@ -1,4 +1,4 @@
-"""Trainings of all variants: planned, done once, kept as weights with their figures beside them."""
+"""Plans and runs the trainings of all variants. Each training runs once; its weights and figures are kept."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nma.files import write_text
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
 
-# The paper's variants: (instances, whether their parameters follow the view direction).
+# The paper's variants: (number of instances, whether the parameters follow the view direction).
 VARIANTS = {
     "single": (1, False),
     "omega_i": (1, True),
@@ -31,7 +31,8 @@ ALL = VARIANTS | INSTANCES
 
 @dataclass(frozen=True)
 class Job:
-    """One training. `size` counts the materials; 0 means the validation set's own, the bound by overfitting."""
+    """One training. `size` is the number of training materials. A size of 0 means the validation set itself, which
+    gives the bound by overfitting."""
 
     variant: str
     size: int
@@ -40,21 +41,22 @@ class Job:
 
     @property
     def stem(self) -> str:
-        """Its files' name."""
+        """The name of the training's files, without a suffix."""
         words = self.variant.replace(" + ", "+").replace(" ", "-"), self.size or "overfit"
         return "{}_{}_{}-steps_seed-{}".format(*words, self.steps, self.seed)
 
     @property
     def recipe(self) -> Recipe:
         instances, directional = ALL[self.variant]
-        # A target can only be stretched in the plane of incidence where it knows wi.
+        # Only a target that follows wi can be stretched in the plane of incidence.
         target = None if directional else "principled"
         settings = {"instances": instances, "directional": directional, "target": target}
         return preset("class", **settings, steps=self.steps, seed=self.seed)
 
 
 def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list[Job]:
-    """All jobs: seed by seed, so that early results span all variants; bounds and more instances with the first one."""
+    """All jobs in their order. Seed comes after seed, so that early results cover all variants. The bounds, and the
+    targets of more `instances`, are trained with the first seed only."""
     jobs, sizes = [], sorted(set(sizes))
     for seed in range(seeds):
         jobs += [Job(name, size, seed, steps) for size in sizes for name in VARIANTS]
@@ -65,10 +67,15 @@ def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list
 
 
 class Store:
-    """The folder of weights and figures, with the data that they come from.
+    """The folder of weights and figures, and the data that they are made from.
 
-    `data` is a dataset of which small sets are the first materials, `validation` what every adapter is judged by, and
-    `name` what determines the validation set. Anything here that was made from other data is made again.
+    Results that were made from other data are made again.
+
+    Args:
+        folder: where weights and figures are kept.
+        data: a dataset; a training set is its first materials.
+        validation: the tables that every adapter is evaluated on.
+        name: a name that identifies the validation set.
     """
 
     def __init__(self, folder: Path, data: Path, validation: nma.Tables, name: str):
@@ -78,20 +85,22 @@ class Store:
 
     @cached_property
     def _tables(self) -> nma.Tables:
-        """All tables of the dataset; read when a training first needs them."""
+        """All tables of the dataset. They are read when a training first needs them."""
         return self._dataset.load()
 
     def check(self, sizes: list[int]) -> None:
-        """Refuses sizes that the dataset does not have."""
+        """Raises an error if the dataset has fewer materials than one of the sizes."""
         most = self._dataset.settings.materials
         if min(sizes) < 1 or max(sizes) > most:
-            raise NmaError(f"sizes {sizes} must lie in 1 .. {most}, the materials of {self._dataset.path}")
+            raise NmaError(
+                f"--sizes {sizes}: {self._dataset.path} has {most} materials; give sizes in 1 .. {most}"
+            )
 
     def weights(self, job: Job) -> Path:
         return self.folder / f"{job.stem}.safetensors"
 
     def adapter(self, job: Job) -> nma.Adapter | None:
-        """The trained adapter, if it is there and was trained like this."""
+        """The trained adapter of a job, or None if it does not exist or was trained with other settings."""
         path = self.weights(job)
         if not path.exists():
             return None
@@ -100,7 +109,7 @@ class Store:
         return adapter if all(found.get(k) == v for k, v in wanted.items()) else None
 
     def train(self, job: Job) -> nma.Adapter:
-        """The adapter of a job, trained unless that is done; a killed training goes on from its checkpoint."""
+        """The adapter of a job. It is trained if it does not exist; a killed training continues from its checkpoint."""
         done = self.adapter(job)
         if done:
             return done
@@ -115,10 +124,10 @@ class Store:
         return adapter
 
     def log_losses(self, job: Job, adapter: nma.Adapter) -> dict[str, Any]:
-        """The figures of an adapter on the validation set, from the cache if they are there."""
+        """The mean figures of an adapter on the validation set, from the cache if possible."""
 
         def measure() -> dict[str, float]:
-            # A quarter of the points of `nma.evaluate_adapter`: .00003 more than it finds, in all variants.
+            # This uses a quarter of the points of `nma.evaluate_adapter`. For all variants, it finds .00003 more.
             found = common.figures(adapter, self.validation, directions=16)
             return {name: round(value, 7) for name, value in mean_metrics(found).items()}
 
@@ -127,7 +136,8 @@ class Store:
     def cached(
         self, job: Job, kind: str, settings: dict[str, Any], adapter: nma.Adapter, make: Callable[[], Any]
     ) -> Any:
-        """What `make` returned for these settings and this training, kept in STEM.KIND.json."""
+        """The result of `make` for these settings and this training, kept in STEM.KIND.json. `make` is called only if
+        the file has no such result."""
         path = self.folder / f"{job.stem}.{kind}.json"
         key = json.loads(json.dumps({**settings, "training": adapter.training}))
         if path.exists():
@@ -146,7 +156,7 @@ class Store:
         return self._tables[: job.size]
 
     def _record(self, job: Job) -> dict[str, Any]:
-        """Where the training's data come from, as the weights file has it."""
+        """The entries of the weights file that say where the training data come from."""
         if job.size == 0:
             return {"data": f"validation set {self._name}"}
         return {
