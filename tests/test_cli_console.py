@@ -39,7 +39,7 @@ def test_numbers_are_never_broken(monkeypatch, width):
 
 
 def test_the_figures_of_an_evaluation_fit_80_columns(monkeypatch):
-    """For figures as they are: of some thousandths, a few of them smaller, and a PSNR."""
+    """The figures are of usual size: some thousandths, a few smaller ones, and a PSNR."""
     row = ("mean", 0.002731, 0.004236, 0.09136, 0.07076, 0.001586, 64.42, 0.00521, 0.001035)
     lines = printed(monkeypatch, 80, ("material", *FIGURES), [row])
     assert len(row) == 1 + len(FIGURES)
@@ -105,8 +105,17 @@ def test_a_fit_shows_a_bar_on_terminals_alone_and_none_if_told(monkeypatch):
 
 
 def test_the_bar_of_a_short_training_is_full_at_its_end(monkeypatch):
-    """Which looks at its loss once alone."""
+    """Such a training reports its loss only once."""
     monkeypatch.setattr(progress, "err", Console(file=io.StringIO(), width=100))
     with progress.TrainingBar(SimpleNamespace(steps=30, bins_per_step=1)) as bar:
         bar.update(SimpleNamespace(step=30, log_losses=[0.1]))
     assert "30/30" in progress.err.file.getvalue()
+
+
+def test_a_bar_counts_and_returns_the_rate_of_work(monkeypatch):
+    monkeypatch.setattr(progress, "err", Console(file=io.StringIO(), width=120))
+    monkeypatch.setattr(console, "time", SimpleNamespace(perf_counter=iter((10.0, 12.0)).__next__))
+    with console.counting("simulating", 3, "Mwalks/s") as show:
+        assert show(3, 5.0, note="gold") == 2.5
+    shown = progress.err.file.getvalue()
+    assert all(text in shown for text in ("simulating", "3/3", "2.5 Mwalks/s", "gold"))

@@ -80,7 +80,7 @@ def test_words_that_are_none_of_these_are_wrong_usage(nma, tmp_path, monkeypatch
     ids=lambda given: given if isinstance(given, str) else given[0],
 )
 def test_outputs_are_called_as_what_reads_them_wants(nma, tmp_path, monkeypatch, words, ending):
-    """Weights in `x.bin` were written after all the work, and no command took them."""
+    """Once, weights were written to `x.bin` after all the work, and no command took them."""
     monkeypatch.chdir(tmp_path)
     for name in ("x", "x.bin"):
         code, out, err = nma(*words, "-o", name)

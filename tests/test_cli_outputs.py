@@ -1,4 +1,4 @@
-"""Commands try their outputs before they begin, and end in one line where something cannot be written."""
+"""Commands try their outputs before they begin. If something cannot be written, they end with one line."""
 
 import errno
 import sys
@@ -9,7 +9,7 @@ import pytest
 from cli_cases import commands, parameters
 from typer.models import ArgumentInfo
 
-import nma.render.demo  # noqa: F401  # what tests replace in it must be there before
+import nma.render.demo  # noqa: F401  # tests replace some of its functions
 from nma.images.io import write_exr
 
 WRITING = [words for words, function in commands() if "output" in {name for name, *_ in parameters(function)}]
@@ -17,7 +17,7 @@ FUNCTIONS = dict(commands())
 
 
 def arguments(words, output):
-    """The command with its output and, in place of all that it reads, names of nothing."""
+    """The command with this output. The files that it would read do not exist."""
     given = []
     for name, _, info in parameters(FUNCTIONS[words]):
         if isinstance(info, ArgumentInfo):
@@ -38,7 +38,7 @@ def _renders_nothing(monkeypatch):
 
 @pytest.fixture
 def bad(tmp_path, monkeypatch):
-    """A folder with outputs that cannot be, of whatever kind a command writes."""
+    """The current folder, with a file in it, below which no output can be written."""
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("mine")
     return tmp_path
@@ -53,7 +53,7 @@ def test_all_commands_that_write_are_known():
 @pytest.mark.parametrize("output", [".", "..", "/", ""])
 def test_a_folder_is_no_output(nma, bad, output):
     for words in WRITING:
-        if words != ("dataset",):  # which is a folder
+        if words != ("dataset",):  # its output is a folder
             code, out, err = nma(*arguments(words, output))
             assert code in (1, 2) and out == "", words
             assert "cannot be written" in err or "must end in" in err, words

@@ -11,7 +11,7 @@ from nma.table import Tables
 
 
 def test_paths_are_printed_as_they_are(nma, tmp_path):
-    """On lines as long as they need, brackets and all."""
+    """They are not broken, and their brackets are no markup."""
     path = tmp_path / "a folder [bold] of {many} letters in its name" / ("n" * 60 + "[/x].npz")
     code, _, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", path)
     assert code == 0
@@ -30,7 +30,7 @@ def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, mo
     code, out, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")
     assert (code, out) == (1, "")
     assert "nma: " in err.splitlines()[-1] and "No space left" in err.splitlines()[-1]
-    # What was simulated waits for the next run.
+    # The simulated material is kept for the next run.
     assert [path.name for path in tmp_path.iterdir()] == ["x.npz.parts"]
     monkeypatch.undo()
     monkeypatch.setattr(table, "tabulate", None)
@@ -52,7 +52,7 @@ def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
 
 
 def test_parts_that_another_run_takes_away_do_no_harm(nma, tmp_path, monkeypatch):
-    """Two runs into one output: the first that ends removes the folder, while the other is about to name a file."""
+    """Two runs write one output. One ends and removes the folder of parts, just before the other renames its file."""
     replace, taken = Path.replace, []
 
     def without_folder(self, target):
