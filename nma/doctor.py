@@ -92,9 +92,7 @@ def _system() -> Finding:
     """Whether the operating system is supported. All tests run on Linux."""
     system = llvm.platform()
     if system == "windows":
-        return Finding(
-            "system", False, "Windows is not supported, Linux in its WSL is", llvm.install_command()
-        )
+        return Finding("system", False, "Windows is not supported; use Linux in WSL", llvm.install_command())
     found = f"{platform.system()} on {platform.machine()}"
     if system == "macos":
         found += ": should work on the CPU, but was never tested; Metal is not supported"
@@ -157,7 +155,7 @@ def _compiler() -> Finding:
     try:
         return Finding("C++ compiler", True, build.compiler(), optional=True)
     except MissingDependencyError:
-        return Finding("C++ compiler", False, f"{purpose}; there is none", _advice("compiler"), True)
+        return Finding("C++ compiler", False, f"{purpose}; no compiler found", _advice("compiler"), True)
 
 
 def _cuda() -> Finding:

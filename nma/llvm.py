@@ -45,7 +45,7 @@ _INSTALL = {
     "arch": "sudo pacman -S llvm-libs",
     "macos": "brew install llvm",
     # Dr.Jit could use LLVM-C.dll there, but this package was never tried on Windows.
-    "windows": "wsl --install (Windows is not supported, Linux in its WSL is)",
+    "windows": "wsl --install (Windows is not supported, so use Linux in WSL)",
 }
 
 

@@ -171,7 +171,7 @@ def test_a_missing_chunk_is_refused_with_the_command_that_completes_it(copy):
     with pytest.raises(DatasetError) as caught:
         copy.load()
     message = str(caught.value)
-    assert "material 3 is missing (2 are); run `nma dataset layered3 " in message
+    assert "material 3 is missing (2 are missing in all); run `nma dataset layered3 " in message
     assert "\n" not in message
     assert copy.load([0, 1]).values.shape[0] == 2
     copy.write()
@@ -221,7 +221,7 @@ def test_other_settings_are_refused(whole, change):
     [
         ({"materials": 0}, "at least one material"),
         ({"walks": 0}, "at least one material"),
-        ({"seed": -1}, "no negative seed"),
+        ({"seed": -1}, "a seed of at least 0"),
         ({"population": "gold"}, "population is one of mixed, .*'gold'"),
         ({"population": "unseen_metals"}, "population is one of"),
     ],
@@ -233,7 +233,7 @@ def test_settings_that_make_no_dataset_are_refused(change, message):
 
 def test_a_material_beyond_the_last_is_refused(whole):
     for index in (24, -1):
-        with pytest.raises(DatasetError, match=f"has 24 materials, none with number {index}"):
+        with pytest.raises(DatasetError, match=f"has 24 materials, but no material {index}"):
             whole.load([index])
 
 

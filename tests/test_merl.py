@@ -201,8 +201,8 @@ def spoilt(value, where=slice(5, 6)):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (lambda: b"", "0 bytes are no MERL file"),
-        (lambda: b"\0" * 11, "11 bytes are no MERL file"),
+        (lambda: b"", "0 bytes are too short for a MERL file"),
+        (lambda: b"\0" * 11, "11 bytes are too short for a MERL file"),
         (lambda: struct.pack("<3i", 90, 90, 360), r"dimensions are \(90, 90, 360\)"),
         (lambda: b"a text file, and no BRDF at all", "dimensions are"),
         (lambda: spoilt(1.0)[:-8], "truncated, 34,992,004 bytes instead of 34,992,012"),

@@ -166,7 +166,7 @@ def test_variants_that_cannot_serve_are_refused():
     mi.set_variant("scalar_rgb")
     with pytest.raises(ParamError, match="not in scalar_rgb; call"):
         from_dict(DIFFUSE)
-    with pytest.raises(ParamError, match="made in llvm_ad_rgb, Mitsuba's variant is scalar_rgb"):
+    with pytest.raises(ParamError, match="made in llvm_ad_rgb, but Mitsuba's variant is now scalar_rgb"):
         source.eval(*pairs(2))
 
 

@@ -50,9 +50,7 @@ def test_windows_is_refused_in_one_line(monkeypatch, tmp_path):
     monkeypatch.setattr(build.sys, "platform", "win32")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for compiles in (build.build_mitsuba, build.library):
-        with pytest.raises(
-            build.BuildError, match="Windows is not supported: .* Linux, and untested on macOS"
-        ) as e:
+        with pytest.raises(build.BuildError, match="cannot be compiled on Windows, .* WSL") as e:
             compiles()
         assert "\n" not in str(e.value)
 
@@ -92,9 +90,9 @@ def test_python_reaches_the_batched_kernel(tmp_path):
 
     with pytest.raises(nma.errors.WeightsError, match="no such weights file"):
         Runtime(tmp_path / "none.safetensors")
-    with pytest.raises(nma.errors.ParamError, match="no instruction set 'mmx'"):
+    with pytest.raises(nma.errors.ParamError, match="unknown instruction set 'mmx'; known are fastest, "):
         Runtime("layered3-3x32", "mmx")
     with pytest.raises(nma.errors.ParamError, match=r"params must have shape \(n, 13\), got \(13,\)"):
         runtime.prepare(params[0], cosines[:1])
-    with pytest.raises(nma.errors.ParamError, match="500 rows of params for 499 cosines"):
+    with pytest.raises(nma.errors.ParamError, match="params has 500 rows, but wi has 499 cosines"):
         runtime.prepare(params, cosines[1:])

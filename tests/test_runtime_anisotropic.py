@@ -141,7 +141,7 @@ def test_cosines_and_other_shapes_are_refused(case):
             call(none(), wi[:, 2])
         with pytest.raises(ParamError, match=r"wi must have shape \(n, 3\), got \(4000, 2\)"):
             call(none(), wi[:, :2])
-        with pytest.raises(ParamError, match="4000 rows of params for 3999 directions"):
+        with pytest.raises(ParamError, match="params has 4000 rows, but wi has 3999 directions"):
             call(none(), wi[1:])
 
 

@@ -93,7 +93,9 @@ def _line(function: Function, node: ast.stmt) -> str:
         return f"    {statement}"
     if assigns and 8 + len(value) <= _WIDTH:
         return f"    {name} =\n        {value}"
-    raise function.unsupported(node, f"a statement too long for {_WIDTH} columns of C++", "name a part of it")
+    raise function.unsupported(
+        node, f"a statement too long for {_WIDTH} columns of C++", "assign a part of it to a name"
+    )
 
 
 def _comment(doc: str) -> str:

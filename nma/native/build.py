@@ -112,7 +112,7 @@ def compiler() -> str:
     """The path of the C++ compiler. Raises `MissingDependencyError` if there is none, and `BuildError` on Windows."""
     if sys.platform == "win32":
         raise BuildError(
-            "Windows is not supported: the C++ runtime is compiled on Linux, and untested on macOS; use WSL, or the "
+            "the C++ runtime cannot be compiled on Windows, but on Linux and (untested) on macOS; use WSL, or the "
             "variants llvm_ad_rgb and cuda_ad_rgb, which need no compiler"
         )
     for name in filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")):

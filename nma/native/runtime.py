@@ -67,7 +67,7 @@ class Runtime:
     def __init__(self, adapter: str | Path, instruction_set: str = "fastest", *, compact: bool = False):
         if instruction_set not in INSTRUCTION_SETS:
             raise ParamError(
-                f"no instruction set {instruction_set!r}; there are {', '.join(INSTRUCTION_SETS)}"
+                f"unknown instruction set {instruction_set!r}; known are {', '.join(INSTRUCTION_SETS)}"
             )
         self._library = _library()
         number = INSTRUCTION_SETS.index(instruction_set) + (_COMPACT if compact else 0)
@@ -177,7 +177,7 @@ class Runtime:
         views = self._views(wi)
         kind, suffix = ("cosines", "_many") if views.ndim == 1 else ("directions", "_direction_many")
         if len(rows) != len(views):
-            raise ParamError(f"{len(rows)} rows of params for {len(views)} {kind}")
+            raise ParamError(f"params has {len(rows)} rows, but wi has {len(views)} {kind}")
         found = np.empty((len(rows), width), np.float32)
         call = getattr(self._library, name + suffix)
         call(self._handle, len(rows), *(_pointer(a) for a in (rows, views, found)))

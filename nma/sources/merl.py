@@ -127,7 +127,7 @@ def _brdf(values: Values, wi: Vec3, wo: Vec3) -> NDArray[np.float32]:
 def _check_size(path: Path, content: bytes) -> None:
     """Raises `SourceError` if the file is too short or too long, or has other dimensions."""
     if len(content) < 12:
-        raise SourceError(f"{path}: {len(content)} bytes are no MERL file; copy it again")
+        raise SourceError(f"{path}: {len(content)} bytes are too short for a MERL file; copy it again")
     shape = tuple(np.frombuffer(content, "<i4", 3).tolist())
     if shape != SHAPE:
         raise SourceError(f"{path}: its dimensions are {shape}, a MERL file has {SHAPE}")

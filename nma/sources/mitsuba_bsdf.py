@@ -61,7 +61,7 @@ class MitsubaBsdf:
         mi: Any = mitsuba
         if mi.variant() != self._variant:
             raise ParamError(
-                f"{self.name} was made in {self._variant}, Mitsuba's variant is {mi.variant()} now"
+                f"{self.name} was made in {self._variant}, but Mitsuba's variant is now {mi.variant()}; make it again"
             )
         with dr.suspend_grad():
             active = mi.Bool((wi.z > 0) & (wo.z > 0))

@@ -52,7 +52,7 @@ class Settings:
     def __post_init__(self) -> None:
         if self.materials < 1 or self.walks < 1 or self.seed < 0:
             raise DatasetError(
-                "a dataset has at least one material and one walk, and no negative seed; "
+                "a dataset needs at least one material, at least one walk, and a seed of at least 0; "
                 f"got {self.materials} materials, {self.walks} walks, seed {self.seed}"
             )
         if self.population not in get_args(Population) or self.population == "unseen_metals":
@@ -182,11 +182,11 @@ class Dataset:
         for row, i in enumerate(indices):
             if not 0 <= i < self.settings.materials:
                 raise DatasetError(
-                    f"{self.path} has {self.settings.materials} materials, none with number {i}"
+                    f"{self.path} has {self.settings.materials} materials, but no material {i}"
                 )
             if not self._has(i):
                 raise DatasetError(
-                    f"{self.path}: material {i} is missing ({len(self.missing())} are); "
+                    f"{self.path}: material {i} is missing ({len(self.missing())} are missing in all); "
                     f"run `nma dataset {self.settings.class_name} {self.path}` with its settings to complete it"
                 )
             try:

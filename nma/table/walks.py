@@ -44,7 +44,8 @@ def tabulate(
     params = source.space.check(params)
     if walks < 1 or len(keys) != len(params):
         raise TableError(
-            f"cannot tabulate {len(params)} material(s) from {walks} walks each with {len(keys)} key(s)"
+            f"cannot tabulate {len(params)} material(s) from {walks} walks each with {len(keys)} key(s); "
+            "give at least one walk, and one key per material"
         )
     total = grid.walks(walks)
     values = np.empty((len(params), grid.bins, 3), np.float32)
