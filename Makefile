@@ -1,11 +1,12 @@
-# make demo    one picture of the whole path: out/demo.png
-# make test    lint and tests, in minutes
-# make test-all   those, types, the experiments and benches in their quick forms: what continuous integration runs
-# make figures list the experiments, and how to run them: make figures ARGS=all, or ARGS="shipped --quick"
-# make types   the type checker
-# make wheel   dist/*.whl
-# make lock    write requirements.lock anew from the newest versions
-# All of them set up .venv first; see tools/setup.sh.
+# make demo      render one picture with the reference and the adapter: out/demo.png
+# make test      lint and fast tests; takes minutes
+# make test-all  lint, types and all tests, with quick runs of the experiments and benches; what .ci/run runs
+# make lint      ruff, import contracts and clang-format
+# make figures   list the experiments; run them with make figures ARGS=all, or ARGS="shipped --quick"
+# make types     run the type checker
+# make wheel     build dist/*.whl
+# make lock      write requirements.lock again, with the newest versions
+# All targets except lock set up .venv first; see tools/setup.sh.
 BIN := .venv/bin
 WORKERS ?= 2
 PYTEST = $(BIN)/python -m pytest --quiet --numprocesses $(WORKERS) --dist worksteal
@@ -18,7 +19,7 @@ demo:
 test: lint
 	$(PYTEST) $(ARGS)
 
-# One run of pytest, so that its summary is the last that is printed.
+# All tests run in one pytest process, so that its summary comes last.
 test-all: lint types
 	$(PYTEST) -m "slow or not slow" $(ARGS)
 

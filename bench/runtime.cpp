@@ -1,8 +1,8 @@
-// Times of the C++ runtime, one line of JSON for each measurement; bench/runtime.py compiles and runs it.
+// Measures the C++ runtime, and prints one line of JSON for each measurement. bench/runtime.py compiles and runs it.
 //
 //     ./runtime NAME=WEIGHTS ...
 //
-// Every figure is the best of many repetitions over 240 random queries on one thread, in nanoseconds per query.
+// A figure is the time per query in nanoseconds: 240 random queries on one thread, best of many repetitions.
 #include "nma.h"
 
 #include <chrono>
@@ -22,7 +22,7 @@ volatile float sink;
 
 double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
-// Nanoseconds per query of `all`, which answers every query once.
+// Nanoseconds per query. `all` is a function that answers every query once.
 template <class F>
 double best(F all, int repetitions = REPETITIONS) {
     double least = 1e30;
@@ -94,7 +94,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
         adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), brdfs.data());
     }));
     if (options.compact || options.set != nma::fastest()) return;
-    // What does not depend on the instruction set.
+    // The rest does not depend on the instruction set.
     const nma::Curves curves(adapter, queries.parameters.data());
     report(network, "curves", "any", best([&] {
         for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weight(0);
@@ -110,7 +110,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
     }));
 }
 
-// A network alone, of zeros, on one query after the other and on all together.
+// Measures a network of zeros without an adapter: on one query after the other, and on all queries together.
 void time_network(const std::string& name, const std::vector<int>& sizes, nma::InstructionSet set, bool compact,
                   int repetitions = REPETITIONS) {
     std::vector<nma::Layer> layers;
@@ -168,7 +168,7 @@ void time_eigen(const std::string& name, const std::vector<int>& sizes) {
 }
 #endif
 
-// Multiply-adds per nanosecond of independent chains: the most that this core can do.
+// The most multiply-adds per nanosecond that this core can do, measured with independent chains of them.
 NMA_TARGET("avx512f,fma") double peak_avx512() {
 #ifdef NMA_X86
     __m512 sums[12];

@@ -1,1 +1,1 @@
-"""What makes committed files, and what sets a checkout up."""
+"""Scripts that write committed files, and a script that sets up a checkout."""

@@ -1,7 +1,8 @@
-"""Places boxes on floors, so that arrows between them cross seldom and run straight.
+"""Places boxes on floors, so that the arrows between them are straight and have few crossings.
 
-The method is Sugiyama, Tagawa and Toda 1981: an arrow that passes a floor gets a place of its own there, floors are
-ordered by the means of their neighbours, and then moved as close to these means as their order allows.
+The method is that of Sugiyama, Tagawa and Toda 1981. An arrow that passes a floor gets a place on this floor. The
+places of each floor are sorted by the mean positions of their neighbours. Then they are moved as close to these means
+as their order allows.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ Arrow = tuple[str, str]
 Place = str | tuple[str, str, int]  # a box, or where an arrow passes a floor
 
 TRIES, SWEEPS = 60, 16
-# How much straighter arrows are to be where they pass floors than where they meet boxes.
+# Weights of an arrow's pieces. A piece counts STRAIGHT times as much for each end that passes a floor instead of
+# meeting a box, so long arrows are straight.
 STRAIGHT = 6.0
 
 
 class Layout(NamedTuple):
-    """Where the boxes' centres are, and the places that arrows pass, from their upper to their lower end."""
+    """The x of the centre of every place, and the places of every arrow from its upper to its lower end."""
 
     x: dict[Place, float]
     ways: dict[Arrow, list[Place]]
@@ -30,7 +32,7 @@ def layout(floors: Sequence[Sequence[str]], arrows: Sequence[Arrow], box: float,
     """Places the boxes of `floors`, highest first.
 
     Args:
-        arrows: pairs of a box and one on a lower floor.
+        arrows: pairs of an upper box and a box on a lower floor.
         box, passage: widths of a box and of an arrow that passes a floor, with the space around them.
     """
     rows, ways = _with_passages(floors, arrows)
@@ -54,7 +56,7 @@ def _with_passages(
 
 
 def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> list[list[Place]]:
-    """The order with the fewest crossings of several tries."""
+    """Tries several orders of the places on the floors, and returns the order with the fewest crossings."""
     dice = random.Random(0)
     best, fewest = rows, float("inf")
     for _ in range(TRIES):
@@ -68,7 +70,7 @@ def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> l
 
 
 def _sort(rows: list[list[Place]], links: Sequence[tuple[Place, Place]], down: bool) -> None:
-    """Sorts floors by the mean places of their neighbours on the floor before, from one end to the other."""
+    """Sorts every floor by the mean positions of its neighbours on the floor before. `down` starts at the top."""
     for n in range(1, len(rows)) if down else range(len(rows) - 2, -1, -1):
         before = {place: k for k, place in enumerate(rows[n - 1 if down else n + 1])}
         found: dict[Place, list[int]] = {}
@@ -85,7 +87,7 @@ def _sort(rows: list[list[Place]], links: Sequence[tuple[Place, Place]], down: b
 
 
 def crossings(rows: Sequence[Sequence[Place]], links: Sequence[tuple[Place, Place]]) -> int:
-    """How often links between neighbouring floors cross."""
+    """The number of crossings of the links between neighbouring floors."""
     count = 0
     for upper, lower in pairwise(rows):
         above, below = ({place: k for k, place in enumerate(row)} for row in (upper, lower))
@@ -124,7 +126,8 @@ def _placed(
 
 
 def _rising(values: Sequence[float], weights: Sequence[float]) -> list[float]:
-    """The numbers nearest to `values` that never fall: neighbours that do are merged to their mean."""
+    """The nondecreasing numbers that are nearest to `values`, by weighted squares. Neighbours that decrease are
+    replaced by their weighted mean."""
     merged: list[tuple[float, float, int]] = []
     for value, weight in zip(values, weights, strict=True):
         merged.append((value, weight, 1))

@@ -1,10 +1,10 @@
-"""Write nma/data/conductors.csv: real metals as linear sRGB indices of refraction.
+"""Writes nma/data/conductors.csv: the indices of refraction of real metals, in linear sRGB.
 
     python tools/make_conductors.py [OUT.csv]
 
-Every spectrum in Mitsuba's `data/ior` goes through Mitsuba's own projection to linear sRGB (unbounded, as its
-`conductor` plugin does it). Transparent crystals (an absorption k near 0) and spectra whose projection had to
-clamp a negative channel are no metals for our purpose and are dropped.
+Mitsuba projects every spectrum in its `data/ior` to linear sRGB without bounds, as its `conductor` plugin does. Two
+kinds of materials are dropped: transparent crystals, whose absorption k is near 0, and spectra with a negative channel
+that the projection had to clamp.
 """
 
 import argparse
@@ -18,13 +18,13 @@ from nma.files import write_text
 OUT = Path(__file__).parents[1] / "nma" / "data" / "conductors.csv"
 HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
 
-# A conductor that absorbs less than this in any channel is a tinted dielectric; the next one above has .114.
+# A material with a lower k than this in any channel is a tinted dielectric. The next material above has .114.
 MIN_K = 0.1
 
-# Kept out of training to test unseen metals: an alkali, a refractory, a bright and a liquid metal, a
-# gold-like nitride, one whose eta rises towards blue, a weakly absorbing oxide, amorphous carbon. The corpus
-# holds many substances twice (`Hg`, `Hg_palik`): all rows of a substance go together, or the test would see
-# training data.
+# These substances are kept out of training, to test unseen metals: an alkali, a refractory, a bright and a liquid
+# metal, a gold-like nitride, one whose eta rises towards blue, a weakly absorbing oxide and amorphous carbon. Mitsuba
+# has many substances twice (`Hg`, `Hg_palik`). All rows of a substance are kept out together; otherwise the test would
+# contain training data.
 HELD_OUT = ("Na", "W", "Rh", "Hg", "TiN", "Ta", "Cu2O", "a-C")
 
 
@@ -47,7 +47,7 @@ def main() -> None:
     out = parser.parse_args().out
 
     mi.set_variant("scalar_rgb")
-    mi.set_log_level(mi.LogLevel.Error)  # it warns of every colour it clamps
+    mi.set_log_level(mi.LogLevel.Error)  # Mitsuba warns about every colour that it clamps
     files = (Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")
     names = sorted((f.name.removesuffix(".eta.spd") for f in files), key=lambda name: (name.lower(), name))
 

@@ -1,9 +1,9 @@
-"""Draws the rooms of the package, what they import, and the way of the data through them.
+"""Draws the rooms of the package, the imports between them, and the way that data takes through them.
 
     python -m tools.map [OUT.svg]     draws docs/images/architecture.svg and lists the rooms
 
-Floors are those of the contract in pyproject.toml, arrows are read from the code. An import that a longer way of
-imports implies is left out.
+The floors come from the contract in pyproject.toml. The arrows are read from the code: an arrow from A to B means that
+A imports B. The arrow is left out if A also reaches B through other rooms.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from tools import rooms
 from tools.layout import Arrow, Layout, Place, layout
 
 OUT = Path(__file__).parents[1] / "docs/images/architecture.svg"
-# What lies beside the package: name, what it is, and a room on whose floor it is drawn.
+# The box outside the package: its name, what it is, and a room on the same floor.
 OUTSIDE = ("runtime/", "The adapter in C++, for any renderer", "render")
 
 
 class Step(NamedTuple):
-    """A step on the way of the data."""
+    """One step of the data: from one room to another, and what is passed on."""
 
     start: str
     end: str
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def listing() -> str:
-    """The rooms, floor by floor, highest first."""
+    """A line of text for each room, with its floor; the highest floor comes first."""
     lines = []
     for number, floor in reversed(list(enumerate(reversed(rooms.floors()), start=1))):
         lines += [f"{number}  {room:11} {rooms.summary(room)}" for room in floor]
@@ -84,7 +84,7 @@ def listing() -> str:
 
 
 class Plan(NamedTuple):
-    """Where everything lies. Floor 0 is the highest."""
+    """The positions of all boxes and arrows. Floor 0 is the highest."""
 
     floors: list[list[str]]
     imports: frozenset[Arrow]
@@ -118,7 +118,7 @@ def plan() -> Plan:
 
 
 def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
-    """Stops where imports cannot be drawn, or where no import carries a step of the data."""
+    """Exits with a message if an import cannot be drawn, or if a step of the data has no import."""
     if unknown := {room for arrow in imports for room in arrow if room not in level}:
         sys.exit(f"{', '.join(sorted(unknown))}: on no floor; add it to the contract in pyproject.toml")
     if upwards := [f"{a} imports {b}" for a, b in sorted(imports) if level[a] >= level[b]]:
@@ -130,7 +130,7 @@ def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
 
 
 def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], float]:
-    """Spreads the arrows at a side of a box in the order of where they go."""
+    """Spreads the arrows at each side of a box. Their order follows the boxes at their other ends."""
     sides: dict[tuple[str, bool], list[tuple[float, Arrow]]] = {}
     for arrow in arrows:
         way = placed.ways[arrow]
@@ -144,7 +144,7 @@ def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], f
 
 
 def drawing() -> str:
-    """The drawing, as SVG."""
+    """Returns the drawing as SVG text."""
     p = plan()
     height = _top(len(p.floors)) + 22 * (len(WAY) + 2)
     size = f'width="{p.width}" height="{height}"'
@@ -166,7 +166,7 @@ def drawing() -> str:
 
 
 def _top(level: int) -> int:
-    """Where the boxes of a floor begin."""
+    """The upper edge of the boxes on a floor, in pixels."""
     return MARGIN + 8 + level * (HEIGHT + RISE)
 
 
@@ -213,7 +213,8 @@ def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
 
 
 def _points(p: Plan, arrow: Arrow) -> list[tuple[int, int]]:
-    """Where an arrow leaves the upper box, enters and leaves the floors that it passes, and meets the lower box."""
+    """The points of an arrow, from top to bottom: it leaves the upper box, enters and leaves every floor that it
+    passes, and ends at the lower box."""
     upper, lower = arrow
     level = p.level(upper)
     points = [(p.x(upper) + p.ports[arrow, upper], _top(level) + HEIGHT)]
@@ -234,7 +235,7 @@ def _number(number: int, x: int, y: int) -> str:
 
 
 def _legend(p: Plan) -> list[str]:
-    """What the arrows mean, and the steps of the data."""
+    """The legend: the meaning of the arrows, and the steps of the data."""
     left, top = MARGIN + 12, _top(len(p.floors)) + 4
     told = (
         "The upper room imports the lower one. No arrow is drawn where a longer way leads to the same room."

@@ -1,7 +1,7 @@
 """The rooms of the package, their floors and the imports between them.
 
-A room is a module or a package directly in `nma/`. Its floor stands in pyproject.toml, in the contract that `make lint`
-checks; what it imports is read from the code, within functions and for type checkers, too.
+A room is a module or a package directly in `nma/`. Its floor is defined in pyproject.toml, in the contract that
+`make lint` checks. Its imports are read from the code. Imports inside functions, and imports for type checkers, count.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Arrow = tuple[str, str]  # from the room that imports to the one that is importe
 
 @cache
 def floors() -> tuple[tuple[str, ...], ...]:
-    """The rooms of each floor, highest first, as the contract has them."""
+    """The rooms of each floor in the contract, highest floor first."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
     (contract,) = (found for found in settings["contracts"] if found["id"] == CONTRACT)
     return tuple(tuple(re.split(r"\s*\|\s*", layer)) for layer in contract["layers"])
@@ -33,7 +33,7 @@ def floors() -> tuple[tuple[str, ...], ...]:
 
 @cache
 def imports() -> frozenset[Arrow]:
-    """All imports of one room by another. The face of the package, `nma/__init__.py`, is no room."""
+    """All imports of one room by another. `nma/__init__.py` does not count as a room."""
     graph = grimp.build_graph(PACKAGE, cache_dir=None)
     pairs = {
         (_room(module), _room(imported))
@@ -48,7 +48,7 @@ def _room(module: str) -> str:
 
 
 def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
-    """Without the arrows that a longer way of arrows goes, too. There must be no circle."""
+    """Removes every arrow from A to B for which other arrows also lead from A to B. There must be no circle."""
 
     @cache
     def below(room: str) -> frozenset[str]:
@@ -63,7 +63,7 @@ def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
 
 
 def circle(arrows: frozenset[Arrow]) -> list[str]:
-    """Rooms that import each other in a circle; none if there is no circle."""
+    """The rooms on a circle of imports, and the rooms above that lead to it; empty if there is no circle."""
     left = set(arrows)
     while True:
         importing = {a for a, _ in left}

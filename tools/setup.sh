@@ -1,18 +1,18 @@
 #!/bin/sh
-# Makes .venv with everything that `make demo` or `make test` needs; run again, it does nothing.
+# Creates .venv with everything that `make demo` or `make test` needs. A second run does nothing.
 #
 #     tools/setup.sh demo|test
 #
-# Needs Python 3.11 or later. What the system lacks beyond it (venv, libatomic, libLLVM, for the tests compilers) is
-# installed with apt-get where we are root on Debian or Ubuntu; otherwise the command to type is printed and we stop.
-# PYTHON=/path/to/python3 chooses the interpreter.
+# This script needs Python 3.11 or later; PYTHON=/path/to/python3 chooses the interpreter. It installs missing system
+# packages with apt-get if it runs as root on Debian or Ubuntu: venv, libatomic, libLLVM and, for the tests, compilers.
+# Otherwise it prints the command that installs them, and stops.
 set -eu
 cd "$(dirname "$0")/.."
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
 
-# The interpreter of .venv if there is one already, else the first that is new enough.
+# Prints the interpreter of .venv if it exists, or else the first interpreter that is new enough.
 find_python() {
     for candidate in .venv/bin/python ${PYTHON:-} python3 python3.14 python3.13 python3.12 python3.11; do
         if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
@@ -23,7 +23,7 @@ find_python() {
     die "Python 3.11 or later is needed, please run: sudo apt-get install python3.11 python3.11-venv"
 }
 
-# The first of several packages that apt knows, or simply the first.
+# Prints the first of several packages that apt knows. If apt knows none of them, prints the first.
 first_known() {
     for package in "$@"; do
         if apt-cache show "$package" >/dev/null 2>&1; then
@@ -34,9 +34,9 @@ first_known() {
     echo "$1"
 }
 
-# Names in Debian and Ubuntu of what the system lacks for this goal.
+# Prints the Debian and Ubuntu packages that the system lacks for this goal.
 missing_packages() {
-    # Tests compile the C++ runtime with two compilers, install it, and run it as an ARM processor would.
+    # Tests compile the C++ runtime with two compilers, install it, and also run it on an emulated ARM processor.
     if [ "$goal" = test ]; then
         for tool in g++ clang++:clang cmake pkg-config aarch64-linux-gnu-g++:g++-aarch64-linux-gnu \
             qemu-aarch64-static:qemu-user-static; do
@@ -53,8 +53,8 @@ missing_packages() {
 
 install_packages() {
     command -v apt-get >/dev/null ||
-        die "please install these with your package manager, here by their names in Debian: $*"
-    [ "$(id -u)" = 0 ] || die "please run, and then the same again: sudo apt-get install $*"
+        die "please install these packages with your package manager (the names are Debian's): $*"
+    [ "$(id -u)" = 0 ] || die "please run this command, then try again: sudo apt-get install $*"
     say "apt-get install $*"
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null ||
         die "could not install: $*"
@@ -64,7 +64,7 @@ install_system() {
     [ -n "$(missing_packages)" ] || return 0
     if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
         say "apt-get update"
-        apt-get update -qq >/dev/null || say "that failed, going on with the package lists there are"
+        apt-get update -qq >/dev/null || say "apt-get update failed; continuing with the present package lists"
     fi
     # shellcheck disable=SC2046 # one word per package
     install_packages $(missing_packages)
@@ -80,11 +80,11 @@ make_venv() {
 
 install_package() { # GOAL EXTRA
     wanted=$(cksum pyproject.toml requirements.lock)
-    for stamp in .venv/installed-test ".venv/installed-$1"; do # what tests need holds what the demo needs
+    for stamp in .venv/installed-test ".venv/installed-$1"; do # the packages for tests include those for the demo
         if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ]; then return 0; fi
     done
-    say "installing the package and pinned versions of what it needs, which takes a minute or a few"
-    # Modules are compiled when they are first imported: most never are.
+    say "installing the package and pinned versions of its dependencies; this takes a few minutes"
+    # --no-compile: Python compiles a module when it is first imported, and most modules never are.
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
         --constraint requirements.lock --editable ".[$2]" >&2
     printf '%s' "$wanted" >".venv/installed-$1"
@@ -101,7 +101,7 @@ python=$(find_python)
 if [ -n "${DRJIT_LIBLLVM_PATH:-}" ]; then
     fault=$("$python" -I nma/llvm.py) || die "DRJIT_LIBLLVM_PATH: $fault; unset it"
 fi
-# Where we may install the system's packages, they arrive while pip works, unless pip needs them.
+# As root, the system packages are installed in the background while pip runs, unless pip itself needs one of them.
 apt=
 if [ "$(id -u)" = 0 ] && "$python" -c 'import ensurepip, venv' 2>/dev/null; then
     install_system &
@@ -111,4 +111,4 @@ else
 fi
 make_venv
 install_package "$goal" "$extra"
-[ -z "$apt" ] || wait "$apt" || die "the system's packages are missing, see above"
+[ -z "$apt" ] || wait "$apt" || die "the system packages could not be installed, see above"
