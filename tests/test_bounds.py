@@ -1,4 +1,4 @@
-"""What a parameter may be is the same wherever it is given: one check, one tolerance, one sentence."""
+"""The bounds of a parameter are the same wherever it is given: one check, one tolerance, one error message."""
 
 import re
 
@@ -33,7 +33,7 @@ def adapter(tmp_path_factory):
 
 
 def pixels(name, value):
-    """An image of good pixels but for one."""
+    """Returns an image of 3 x 4 correct pixels, with the pixel at x=2, y=1 replaced by `value`."""
     image = np.full((3, 4, LAYERED3[name].size), PLAIN[name], np.float32)
     image[1, 2] = value
     return image
@@ -44,7 +44,7 @@ def text(value):
 
 
 class Entries:
-    """All ways to give a parameter, each a function of its name and value, which raises where it is refused."""
+    """All ways to give a parameter. Each method takes its name and value, and raises if the value is refused."""
 
     def __init__(self, folder, adapter, material_file, command):
         self.folder, self.adapter, self.material_file, self.command = folder, adapter, material_file, command
@@ -64,7 +64,7 @@ class Entries:
         material = self.material_file()
         given = ",".join(map(str, np.ravel(value)))
         status, _, said = self.command("render", material, "--set", f"{name}={given}", "--mesh", "none.ply")
-        # Were the value allowed, the command would miss the mesh next.
+        # If the value is allowed, the command fails later, because the mesh does not exist.
         if status and "none.ply" not in said:
             raise NmaError(" ".join(said.split()))
 
@@ -86,7 +86,7 @@ class Entries:
 
 
 class TrainedEntries(Entries):
-    """Those that an adapter's training range holds for."""
+    """The ways to give a parameter to an adapter. The training range of the adapter bounds the value."""
 
     def vector(self, name, value):
         nma.Adapter.load(self.adapter).check(LAYERED3.vector(PLAIN | {name: value}))
@@ -139,12 +139,12 @@ def give(tmp_path, adapter, material_file, nma):
 
 
 def beyond(kind, steps):
-    """Name and value of all parameters, `steps` tolerances beyond either bound; one channel of a triple."""
+    """Yields (name, value) with values that lie `steps` tolerances beyond either bound, in one channel of a triple."""
     for name in NAMES:
         low, high = LAYERED3[name].bounds(kind)
         slack = steps * ROUNDING * min(high - low, 1.0)
         for value in (low - slack, high + slack):
-            # Bounds at which single precision rounds by more than the tolerance take larger steps.
+            # Skips values that single precision rounds back onto the bound.
             if float(np.float32(value)) != float(np.float32(low if value < low else high)):
                 yield name, value if LAYERED3[name].size == 1 else (PLAIN[name], value, PLAIN[name])
 
@@ -167,7 +167,7 @@ def test_a_wrong_value_is_refused_in_one_sentence_wherever_it_is_given(give, kin
 
 
 def number_free(message):
-    """Without digits that single precision makes up, as in 1.000003."""
+    """Removes the digits that come from rounding to single precision, as in 1.000003."""
     return re.sub(r"(\d\.\d{5})\d+", r"\1", message)
 
 
@@ -186,7 +186,7 @@ def test_single_precision_keeps_bounds_within_the_tolerance(space, kind):
         assert not bounds.bad(ends).any() and not bounds.bad(ends.astype(np.float64)).any()
 
 
-def test_numpy_and_drjit_agree_on_what_is_bad_and_where_it_is_moved():
+def test_numpy_and_drjit_agree_on_bad_values_and_on_clamped_values():
     bounds = Bounds(0.001, 0.5)
     x = np.array([0.0, 0.001, 0.25, 0.5, 0.6, *INFINITE], np.float32)
     lanes = mi.Float(x)
@@ -199,14 +199,14 @@ def test_numpy_and_drjit_agree_on_what_is_bad_and_where_it_is_moved():
     np.testing.assert_allclose(bounds.moved(x), moved)
 
 
-def test_the_derivative_on_a_bound_is_1_so_that_values_come_back():
+def test_the_derivative_of_clamping_is_1_on_a_bound():
     x = mi.Float([-1.0, 0.0, 0.5, 1.0, 2.0])
     dr.enable_grad(x)
     dr.backward(Bounds(0.0, 1.0).moved(x))
     np.testing.assert_array_equal(x.grad.numpy(), [0, 1, 1, 1, 0])
 
 
-def test_cpp_allows_the_same_numbers(adapter):
+def test_cpp_allows_the_same_values(adapter):
     runtime = Runtime(adapter)
     for steps, known in ((0.5, True), (3, False)):
         for name, value in beyond("training", steps):

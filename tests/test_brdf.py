@@ -1,4 +1,4 @@
-"""What adapters of every kind prepare: a BRDF in its frame, whose methods agree wherever the view direction points."""
+"""Adapters of every kind prepare a BRDF with its frame. Its methods agree for every azimuth of the view direction."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from nma.target import Blend, Plane, Principled
 
 nma.render.use("llvm_ad_rgb")
 
-# The class, the encoding, the target, and whether it is bounded.
+# For each kind of adapter: its class, encoding and target, and whether its energy is bounded.
 KINDS = {
     "isotropic": (LAYERED3, "layered3", "principled", False),
     "stretched": (LAYERED3, "layered3", "stretched", False),
@@ -31,7 +31,7 @@ KINDS = {
 ISOTROPIC = tuple(kind for kind in KINDS if kind != "anisotropic")
 IN_PLANE = ("stretched", "bounded", "single")
 AZIMUTHS = (0.0, 2.0, 4.5)
-# A bright stretched metal, and a paint with sheen: together they reflect more than they receive.
+# A blend of a bright stretched metal and a paint with sheen. It reflects more light than it receives.
 BLEND = Blend(
     (
         Principled(Color(1.0, 0.9, 0.8), 0.5, 1.0, 0.5, 0.1, 0.1, 0.1, 0.3, 0.2, -4.0, 0.1, -0.1, 0.5),
@@ -43,7 +43,7 @@ BLEND = Blend(
 
 @cache
 def adapter(kind):
-    """One whose blend moves about `BLEND` with all that the network sees."""
+    """Returns an adapter whose blend is near `BLEND` and varies with every input of the network."""
     space, name, wanted, bounded = KINDS[kind]
     raw = np.array(target.encode(BLEND, target.TARGETS[wanted]), np.float32)
     slopes = np.random.default_rng(0).standard_normal((len(raw), encoding.size(name, space, True)))
@@ -52,7 +52,7 @@ def adapter(kind):
 
 
 def columns(of, like):
-    """Parameters of one material, as wide as `like`."""
+    """Returns the parameters of one material as a list of arrays, each as long as `like`."""
     vector = LAYERED3.sample(np.random.default_rng(1), 1)[0] if of.space is LAYERED3 else []
     return [0.0 * like + float(x) for x in vector]
 
@@ -62,7 +62,7 @@ def prepared(kind, wi):
 
 
 def turned(v, angle):
-    """About the normal."""
+    """Rotates directions about the normal by an angle in radians."""
     c, s = math.cos(angle), math.sin(angle)
     return Vec3(c * v.x - s * v.y, s * v.x + c * v.y, v.z)
 
@@ -75,7 +75,10 @@ def pairs(n=2000):
 @pytest.mark.parametrize("azimuth", AZIMUTHS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_samples_follow_the_density_in_the_local_frame(kind, azimuth):
-    """Chi-square at level .01, Sidak-corrected over all kinds and azimuths."""
+    """Samples follow the density of `pdf`, for every kind of adapter and every azimuth of the view (chi-square test).
+
+    The false-alarm rate is .01 over all cases together (Sidak). A failure means biased renderings.
+    """
 
     def view(like):
         wi = turned(Vec3(0.8, 0.0, 0.6), azimuth)
@@ -96,7 +99,7 @@ def test_samples_follow_the_density_in_the_local_frame(kind, azimuth):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_methods_agree(kind):
+def test_the_methods_of_a_brdf_agree(kind):
     wi, wo = pairs()
     brdf = prepared(kind, wi)
     value, pdf = brdf.eval_pdf(wi, wo)
@@ -119,13 +122,13 @@ def test_an_isotropic_material_looks_the_same_when_both_directions_turn(kind):
 
 
 def off(found, expected):
-    """The mean difference, as a share of the mean."""
+    """Returns the mean absolute difference, relative to the mean of `expected`."""
     return np.abs(stacked(found) - stacked(expected)).mean() / stacked(expected).mean()
 
 
 @pytest.mark.parametrize("kind", IN_PLANE)
-def test_a_frame_that_is_forgotten_shows(kind):
-    """The error that callers made who took the blend alone, and which a `Brdf` makes impossible."""
+def test_evaluating_a_blend_without_its_frame_is_wrong(kind):
+    """A blend evaluated without its frame is more than 40 % off, so that other tests here would notice the mistake."""
     wi, wo = pairs()
     brdf = prepared(kind, wi)
     assert off(target.eval(brdf.blend, wi, wo), brdf.eval(wi, wo)) > 0.4
@@ -148,14 +151,17 @@ def test_bounded_adapters_are_dimmed():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_what_stretches_in_the_plane_of_incidence_has_a_frame(kind):
-    """Others record no operation for it."""
+def test_only_targets_that_stretch_in_the_plane_of_incidence_have_a_frame(kind):
+    """Other BRDFs have no frame, so that Dr.Jit records no operation for one."""
     assert isinstance(prepared(kind, pairs()[0]).plane, Plane if kind in IN_PLANE else type(None))
 
 
 @pytest.mark.parametrize("kind", ISOTROPIC)
-def test_curves_and_numbers_are_of_the_same_brdf(kind):
-    """The network's rounding, and interpolation between nodes."""
+def test_curves_and_numbers_describe_the_same_brdf(kind):
+    """BRDFs from numbers and from curves equal the prepared one within 1e-5 and 1e-3.
+
+    The first difference is rounding in the network, the second also interpolation between the nodes of the curves.
+    """
     wi, wo = pairs()
     own, expected = adapter(kind), prepared(kind, wi).eval(wi, wo)
     flat = own.numbers(np.reshape([c[0] for c in columns(own, wi.z)], (1, -1)), wi.z)[0]

@@ -1,4 +1,4 @@
-"""Images in material files: colours, channels, places, and what is refused."""
+"""Images in material files: their colours, channels and repeats, and the files that are refused."""
 
 import struct
 import zlib
@@ -28,7 +28,7 @@ def test_colours_are_made_linear_and_numbers_are_not(material_file, tmp_path):
 
 
 def test_a_colour_may_be_given_in_hexadecimal_digits_of_srgb(material_file):
-    """#3366ee is 51, 102, 238 of 255."""
+    """The colour #3366ee is the sRGB triple 51, 102, 238 of 255, converted to linear light."""
     for digits in ("#3366ee", "#3366EE"):
         material = materials.load(material_file("albedo = 0.5", f"albedo = '{digits}'"))
         np.testing.assert_allclose(material.values["albedo"], [0.0331048, 0.1328683, 0.8549926], rtol=1e-5)
@@ -51,7 +51,7 @@ def test_a_channel_of_a_packed_image_is_chosen_by_its_letter(material_file, tmp_
         np.testing.assert_allclose(texture.read()[..., 0], PACKED[..., n] / 255, atol=1e-6)
 
 
-def test_the_range_concerns_the_chosen_channel_alone(material_file, tmp_path):
+def test_only_the_chosen_channel_must_lie_in_the_range(material_file, tmp_path):
     write_image(tmp_path / "orm.png", PACKED)
     for letter, good in zip("rgba", (False, True, False, True), strict=True):
         given = f"alpha_bottom = {{ texture = 'orm.png', channel = '{letter}' }}"
@@ -64,7 +64,7 @@ def test_the_range_concerns_the_chosen_channel_alone(material_file, tmp_path):
 
 
 def test_a_coloured_image_for_one_number_is_refused_unless_a_channel_is_chosen(material_file, tmp_path):
-    """Grey ones of three channels need no choice; the message says how to choose."""
+    """The message says how to choose a channel. A grey image of three equal channels needs no choice."""
     write_image(tmp_path / "orm.png", PACKED[..., :3].copy())
     texture = materials.load(material_file("sigma_t = 0.25", "sigma_t = { texture = 'orm.png' }")).values[
         "sigma_t"
@@ -78,7 +78,7 @@ def test_a_coloured_image_for_one_number_is_refused_unless_a_channel_is_chosen(m
 
 
 @pytest.mark.parametrize("pixels", [PACKED[..., 1:2], PACKED[..., 1::2]], ids=["grey", "grey and alpha"])
-def test_grey_images_have_every_colour_s_channel(material_file, tmp_path, pixels):
+def test_a_grey_image_has_equal_channels_r_g_and_b(material_file, tmp_path, pixels):
     path = write_image(tmp_path / "grey.png", pixels.copy())
     assert materials.load(material_file()).changed({"albedo": {"texture": str(path)}}).textures[
         "albedo"
@@ -98,7 +98,7 @@ def test_grey_images_have_every_colour_s_channel(material_file, tmp_path, pixels
         ("channel = ['g']", "channel is"),
     ],
 )
-def test_a_channel_that_is_none_is_refused(material_file, tmp_path, given, message):
+def test_an_unknown_channel_is_refused(material_file, tmp_path, given, message):
     write_image(tmp_path / "orm.png", PACKED)
     with pytest.raises(MaterialError, match=message):
         materials.load(material_file("sigma_t = 0.25", f"sigma_t = {{ texture = 'orm.png', {given} }}"))
@@ -112,7 +112,7 @@ def test_a_channel_that_is_none_is_refused(material_file, tmp_path, given, messa
         texture.values["sigma_t"].read()
 
 
-def test_an_image_of_other_channels_is_refused_with_their_names(material_file, tmp_path):
+def test_an_image_without_colour_channels_is_refused_with_the_names_of_its_channels(material_file, tmp_path):
     kind = mi.Bitmap.PixelFormat.MultiChannel
     mi.Bitmap(np.zeros((2, 2, 2), np.float32), kind, ["Z", "ID"]).write(str(tmp_path / "other.exr"))
     texture = materials.load(material_file("sigma_t = 0.25", "sigma_t = { texture = 'other.exr' }")).values[
@@ -123,7 +123,7 @@ def test_an_image_of_other_channels_is_refused_with_their_names(material_file, t
 
 
 def test_images_repeat_as_often_as_the_file_says(material_file, tmp_path):
-    """A texture's own `uv_scale` before that of the material, which counts for textures that are added, too."""
+    """A texture with a `uv_scale` repeats as that says. All others, also added ones, repeat as the material says."""
     write_image(tmp_path / "image.png", PACKED)
     both = "alpha_bottom = { texture = 'image.png', channel = 'g', uv_scale = 2.5 }\nalbedo = { texture = 'image.png' }"
     path = material_file("alpha_bottom = 0.2", both)
@@ -146,7 +146,7 @@ def test_a_textured_material_has_no_vector(material_file, tmp_path):
 
 
 @pytest.mark.parametrize("fault", [np.nan, np.inf, -0.5, 2.0])
-def test_a_texture_with_a_forbidden_value_is_refused_with_its_place(material_file, tmp_path, fault):
+def test_a_texture_with_a_forbidden_value_is_refused_with_the_pixel(material_file, tmp_path, fault):
     pixels = np.full((3, 5, 3), 0.5, np.float32)
     pixels[2, 4, 1] = fault
     write_image(tmp_path / "image.exr", pixels)
@@ -166,7 +166,7 @@ def test_a_file_that_is_no_image_is_refused(material_file, tmp_path):
         texture.read()
 
 
-def test_an_image_that_claims_too_many_pixels_is_refused_before_it_takes_memory(material_file, tmp_path):
+def test_an_image_that_claims_too_many_pixels_is_refused_before_it_is_decoded(material_file, tmp_path):
     header = struct.pack(">4sIIBBBBB", b"IHDR", 100_000, 100_000, 8, 2, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)

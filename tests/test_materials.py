@@ -1,4 +1,4 @@
-"""Named materials, the format of their files, and the corpus of conductors."""
+"""Named materials, the format of material files, and the list of conductors."""
 
 import re
 import subprocess
@@ -78,7 +78,7 @@ def test_a_medium_through_which_walks_would_not_end_is_refused(material_file, gi
 
 
 def test_a_metal_whose_reflectance_overflows_is_refused(material_file):
-    """From an index of about 1e10 on, single precision made it black."""
+    """An index of 1e4 is allowed and reflects all light. In single precision an index of 1e10 would look black."""
     with pytest.raises(MaterialError, match=r"k_conductor is .* allowed is 0 \.\. 10000"):
         materials.load(material_file('conductor = "Au"', "eta_conductor = 1\nk_conductor = 1e10"))
     largest = materials.load(material_file('conductor = "Au"', "eta_conductor = 1e4\nk_conductor = 1e4"))
@@ -86,7 +86,7 @@ def test_a_metal_whose_reflectance_overflows_is_refused(material_file):
     assert reflectance == pytest.approx(1.0, abs=1e-3)
 
 
-def test_sources_take_what_adapters_do_not_know(material_file):
+def test_a_file_may_hold_values_beyond_the_training_range_of_adapters(material_file):
     assert materials.load(material_file("sigma_t = 0.25", "sigma_t = 5")).vector()[-1] == 5
 
 
@@ -151,7 +151,7 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_fault(material_file, old
     assert len(str(error.value)) < 1000 and "\n" not in str(error.value)
 
 
-# Values, keys and scraps that take the place of those of a good file.
+# Values, keys and fragments of text. The next test writes them into a good file, in place of its keys and values.
 NASTY = (
     "0.5",
     "1",
@@ -190,8 +190,11 @@ NASTY += (
 NASTY += ("[" * 3000, "1" * 400, "1" * 5000, "0x" + "f" * 9000, '"' + "a" * 5000 + '"', "a" + ".a" * 900)
 
 
-def test_whatever_a_file_holds_it_loads_or_is_refused_in_one_line(material_file):
-    """Values and keys of a good file replaced, one or two at a time, and sometimes a piece of it cut out."""
+def test_any_file_either_loads_or_is_refused_in_one_line(material_file):
+    """400 random faulty files either load or raise one short line.
+
+    Each is a good file with one or two keys or values replaced, and sometimes with a piece cut out.
+    """
     path, rng = material_file(), np.random.default_rng(0)
     good = [re.split("( = )", line) for line in path.read_text().strip().splitlines()]
     loaded = refused = 0
@@ -212,7 +215,7 @@ def test_whatever_a_file_holds_it_loads_or_is_refused_in_one_line(material_file)
     assert loaded > 5 and refused > 200
 
 
-def test_a_byte_order_mark_is_fine_and_so_are_other_line_ends(material_file):
+def test_a_byte_order_mark_and_windows_line_ends_are_accepted(material_file):
     path = material_file()
     plain = materials.load(path).vector()
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
@@ -243,7 +246,7 @@ def test_an_unknown_name_is_refused_with_a_suggestion():
         materials.load("missing.toml")
 
 
-def test_the_corpus_of_conductors_is_what_the_conventions_say():
+def test_the_list_of_conductors_is_as_the_conventions_say():
     metals = load_conductors()
     assert len(metals) == 51
     assert (metals.eta.min().round(3), metals.eta.max().round(2)) == (0.038, 7.51)
@@ -251,7 +254,7 @@ def test_the_corpus_of_conductors_is_what_the_conventions_say():
     assert sum(metals.held_out[metals.distinct()]) == 8
 
 
-def test_no_metal_is_both_seen_and_held_out():
+def test_no_metal_is_both_trained_on_and_held_out():
     metals = load_conductors()
     values = np.hstack([metals.eta, metals.k])
     for unseen in values[metals.held_out]:
@@ -259,7 +262,7 @@ def test_no_metal_is_both_seen_and_held_out():
         assert distance.min() > 0.05
 
 
-def test_the_corpus_is_what_its_script_makes(tmp_path):
+def test_the_script_reproduces_the_committed_list_of_conductors(tmp_path):
     out = tmp_path / "conductors.csv"
     subprocess.run(
         [sys.executable, ROOT / "tools" / "make_conductors.py", out], check=True, capture_output=True
@@ -277,7 +280,7 @@ def test_a_vector_becomes_a_material_and_back():
 
 
 @pytest.mark.parametrize("name", materials.names())
-def test_descriptions_promise_nothing_that_the_classes_lack(name):
-    """Isotropic and homogeneous layers show neither brushing nor flakes."""
+def test_descriptions_promise_no_effect_that_the_class_lacks(name):
+    """No description names brushing, flakes or similar effects, because the layers are isotropic and homogeneous."""
     text = materials.load(name).description.lower()
     assert not [word for word in ("brush", "flake", "spark", "scratch", "grain", "fibre") if word in text]

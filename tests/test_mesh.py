@@ -1,4 +1,4 @@
-"""Meshes in place of the shader ball: where they stand, what they keep, what is refused."""
+"""Meshes in place of the shader ball: their place and size, what is kept of the file, and which files are refused."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from nma.render.textures import bitmap_texture
 nma.render.use("llvm_ad_rgb")
 import mitsuba as mi  # noqa: E402
 
-# A wedge, twice as tall (y) as it is wide, far from the origin.
+# A wedge far from the origin. Its height (y) is twice its width (x).
 OBJ = """
 v 10 0 5\nv 12 0 5\nv 12 0 6\nv 10 4 5
 vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1
@@ -49,7 +49,7 @@ def test_a_mesh_stands_on_the_floor_in_the_middle_as_large_as_the_ball(wedge, up
     extent = high - low
     full = extent[2] / HEIGHT if up == "y" else extent[1] / WIDTH
     assert full == pytest.approx(1.0, rel=1e-5)
-    # The same proportions as in the file.
+    # The mesh keeps the proportions of the file.
     assert sorted(extent / extent.max()) == pytest.approx([0.25, 0.5, 1.0], rel=1e-5)
 
 
@@ -94,7 +94,7 @@ def test_a_mesh_that_cannot_be_shown_is_refused(tmp_path, text, message):
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_mesh_of_another_kind_or_axis_is_refused(wedge, tmp_path):
+def test_an_unknown_file_format_or_axis_is_refused(wedge, tmp_path):
     with pytest.raises(MeshError, match=r"must end in \.ply or \.obj"):
         mesh_shape(tmp_path / "mesh.stl")
     with pytest.raises(MeshError, match="take z or y"):

@@ -1,7 +1,7 @@
-"""The declaration of a class: the laws its parameters are drawn by, its bounds, and what it refuses.
+"""The declaration of a class: the distributions of its parameters, its bounds, and the values that it refuses.
 
-Kolmogorov-Smirnov tests of all columns of a population share the false-alarm rate `FALSE_ALARM` (Sidak); seeds are
-fixed.
+The Kolmogorov-Smirnov tests of all columns of a population have the false-alarm rate `FALSE_ALARM` together (Sidak).
+Seeds are fixed.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def column(vectors, name, channel=0):
 
 
 def metal_of(vectors):
-    """Row of the corpus that each vector's conductor is, -1 for none."""
+    """Returns the index of each vector's conductor in the list of conductors, -1 if it is not in the list."""
     metals = load_conductors()
     corpus = np.hstack([metals.eta, metals.k])
     conductors = np.hstack(
@@ -38,7 +38,7 @@ def metal_of(vectors):
 
 
 def assert_laws(samples):
-    """Kolmogorov-Smirnov tests of (values, cumulative distribution) pairs."""
+    """Asserts that all samples, pairs of (values, cumulative distribution), pass a Kolmogorov-Smirnov test."""
     level = 1.0 - (1.0 - FALSE_ALARM) ** (1.0 / len(samples))
     for name, (values, cdf) in samples.items():
         assert stats.kstest(values, cdf).pvalue > level, name
@@ -46,7 +46,10 @@ def assert_laws(samples):
 
 @pytest.mark.parametrize("population", POPULATIONS)
 def test_every_parameter_follows_its_law(population):
-    """Table 1: 10^U, U, and 1 - U^2, whose distribution is 1 - sqrt(1 - x)."""
+    """Parameters are drawn by the laws of the paper's Table 1: 10^U, U and 1 - U^2.
+
+    The cumulative distribution of 1 - U^2 is 1 - sqrt(1 - x). A failure means that a parameter is drawn by another law.
+    """
     vectors = draw(population)
     logarithmic = {"alpha_top": (-3.0, 2.5), "alpha_bottom": (-3.0, 3.0)}
     samples = {
@@ -61,7 +64,7 @@ def test_every_parameter_follows_its_law(population):
 
 @pytest.mark.parametrize("population", ("range", "mixed"))
 def test_conductors_of_the_range_are_uniform(population):
-    """All of them in `range`, those that are no real metal in `mixed`."""
+    """Conductors are uniform over the range: all of `range`, and the conductors of `mixed` that are no real metals."""
     vectors = draw(population)
     vectors = vectors[metal_of(vectors) < 0]
     samples = {}
@@ -87,7 +90,7 @@ def test_metals_are_drawn_evenly_from_their_own_list(population, held_out):
     corpus = load_conductors()
     metals = metal_of(draw(population))
     metals = metals[metals >= 0]
-    # Some substances stand in the corpus twice, with equal numbers.
+    # Some metals are in the list twice, with equal values, and are drawn twice as often.
     assert (corpus.held_out[metals] == held_out).all()
     rows = np.nonzero(corpus.held_out == held_out)[0]
     values = np.hstack([corpus.eta, corpus.k])[rows]
@@ -98,7 +101,7 @@ def test_metals_are_drawn_evenly_from_their_own_list(population, held_out):
 
 
 def test_no_metal_held_out_is_ever_trained_on():
-    """Neither under its own name nor, with equal numbers, under another."""
+    """No training draw has the values of a held-out metal, neither under its own name nor under another."""
     corpus = load_conductors()
     values = np.hstack([corpus.eta, corpus.k])
     held_out = values[corpus.held_out]
@@ -120,7 +123,7 @@ def test_a_third_of_the_unseen_metals_is_held_out():
 
 @pytest.mark.parametrize("population", POPULATIONS)
 def test_draws_lie_in_the_training_range(population):
-    """Real metals too: the range was chosen around them. Hence all of it is physically valid."""
+    """All draws lie in the training range, including real metals, and the training range lies in the valid range."""
     vectors = draw(population)
     np.testing.assert_array_equal(LAYERED3.check(vectors, "training"), vectors)
     np.testing.assert_array_equal(LAYERED3.check(vectors), vectors)
@@ -137,7 +140,7 @@ def test_an_unknown_population_is_refused():
         draw("gold", 1)
 
 
-def test_the_class_is_table_1():
+def test_the_class_is_that_of_the_paper_s_table_1():
     assert SPACES == {"layered3": LAYERED3, "measured": MEASURED, "library": LIBRARY}
     assert tuple(p.name for p in LAYERED3.params) == NAMES
     assert LAYERED3.size == 13
@@ -208,7 +211,7 @@ FINITE_BOUNDS = [
 
 
 @pytest.mark.parametrize(("bounds", "name", "side"), FINITE_BOUNDS)
-def test_what_lies_beyond_a_bound_is_refused_with_name_row_and_range(bounds, name, side):
+def test_a_value_beyond_a_bound_is_refused_with_name_row_and_range(bounds, name, side):
     vectors = draw("mixed", 4)
     param = LAYERED3[name]
     bound = param.bounds(bounds)[side]
@@ -228,7 +231,7 @@ def test_what_lies_beyond_a_bound_is_refused_with_name_row_and_range(bounds, nam
 
 
 def test_rounding_beyond_a_bound_is_forgiven():
-    """Parameters that went through single precision are those of the range."""
+    """The ends of the range are accepted after rounding to single precision, and stay within the range."""
     ends = np.stack(LAYERED3.columns("training"))
     rounded = ends.astype(np.float32)
     checked = LAYERED3.check(rounded, "training")
@@ -238,7 +241,7 @@ def test_rounding_beyond_a_bound_is_forgiven():
 
 @pytest.mark.parametrize("clamp", (False, True))
 @pytest.mark.parametrize("value", (np.nan, np.inf, -np.inf))
-def test_what_is_not_finite_is_refused_even_where_clamped(value, clamp):
+def test_infinite_values_and_nan_are_refused_even_with_clamp(value, clamp):
     vectors = draw("mixed", 3)
     vectors[1, 12] = value
     for bounds in ("training", "valid"):
@@ -262,7 +265,7 @@ def test_check_leaves_its_argument_alone():
     np.testing.assert_array_equal(vectors, before)
 
 
-def test_a_class_without_a_conductor_draws_all_populations_alike():
+def test_a_class_without_a_conductor_accepts_every_population():
     space = ParamSpace("paint", (Param("gloss", "g", "uniform", 0.0, 1.0, 0.0, 1.0, "how shiny"),))
     for population in POPULATIONS:
         assert space.sample(np.random.default_rng(0), 5, population).shape == (5, 1)

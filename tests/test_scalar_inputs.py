@@ -1,4 +1,4 @@
-"""Inputs of the plugins compiled for Mitsuba's scalar renderer: what they may be, how they are edited and asked for."""
+"""The compiled plugins for Mitsuba's scalar renderer check their inputs, and accept edits and queries of them."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 from nma.images.io import write_exr, write_png
 
-# Each compiles plugins or renders in processes of its own.
+# Each test compiles the plugins or renders in processes of its own.
 pytestmark = [pytest.mark.slow]
 
 
@@ -34,7 +34,7 @@ EDITS = """
 
 @pytest.mark.parametrize("kind", ["nma", "layered"])
 def test_edits_are_rendered_at_once_or_refused(kind):
-    """Numbers, colours, pixels; after a refused edit nothing is rendered until it is mended."""
+    """An edit of a number, a colour or pixels takes effect at once. A bad value stops all rendering until corrected."""
     finished(
         EDITS
         + """
@@ -83,7 +83,7 @@ def test_edits_are_rendered_at_once_or_refused(kind):
 
 @pytest.mark.parametrize("kind", ["nma", "layered"])
 def test_edits_of_shared_textures_are_seen(kind):
-    """Mitsuba does not tell the second of two owners."""
+    """A BSDF sees edits of a texture that two BSDFs share, although Mitsuba notifies only one of the two."""
     finished(
         EDITS
         + """
@@ -115,7 +115,7 @@ def test_edits_of_shared_textures_are_seen(kind):
 
 
 @pytest.mark.parametrize("kind", ["nma", "layered"])
-def test_attributes_and_channels_of_inputs(kind):
+def test_inputs_are_attributes_and_may_come_from_one_channel(kind):
     finished(
         EDITS
         + """
@@ -161,8 +161,11 @@ end_header
 
 
 @pytest.mark.parametrize("kind", ["nma", "layered"])
-def test_what_only_a_mesh_knows_is_moved_into_the_range(kind, tmp_path):
-    """Beside a constant, too, which is known when the scene is loaded."""
+def test_attributes_of_a_mesh_are_clamped_to_the_range(kind, tmp_path):
+    """Vertex colours beyond the range render like the constant 1, alone and inside a checkerboard.
+
+    Loading cannot check them, because only the mesh knows their values.
+    """
     (tmp_path / "plate.ply").write_text(PLATE)
     colours = {"type": "mesh_attribute", "name": "vertex_color"}
     finished(
@@ -191,7 +194,7 @@ def test_what_only_a_mesh_knows_is_moved_into_the_range(kind, tmp_path):
 
 @pytest.fixture(scope="module")
 def bitmap(tmp_path_factory):
-    """Textures of ones by the value of their pixel at x=1, y=2."""
+    """A function that writes an image of ones, with a given pixel at x=1, y=2, and returns its texture."""
     folder = tmp_path_factory.mktemp("textures")
 
     def made(pixel):
@@ -212,8 +215,11 @@ def png(folder, raw):
 COLOUR = {"type": "rgb", "value": [0.1, 0.5, 0.9]}
 
 
-def test_what_an_input_may_not_be_is_refused_with_its_name(bitmap, tmp_path):
-    """Numbers of sRGB 128: .2158605 (IEC 61966-2-1), 128 / 255 where the texture is `raw`."""
+def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
+    """Each wrong input is refused by a message with its name, and each correct one loads.
+
+    The sRGB byte 128 is .2158605 in linear light (IEC 61966-2-1), and 128 / 255 if the texture is `raw`.
+    """
     one = str(tmp_path / "one.safetensors")
     known = [
         x for value in MATERIAL.values() for x in (value["value"] if isinstance(value, dict) else [value])

@@ -1,4 +1,4 @@
-"""Plugins compiled for Mitsuba's scalar renderer: pictures, alone and in composites, and albedos."""
+"""The compiled plugins for Mitsuba's scalar renderer: their pictures, alone and in composites, and their albedos."""
 
 import dataclasses
 import json
@@ -11,15 +11,15 @@ import pytest
 from adapter_cases import random_anisotropic_adapter
 from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
-# Each compiles plugins or renders in processes of its own.
+# Each test compiles the plugins or renders in processes of its own.
 pytestmark = [pytest.mark.slow]
 
 TEXTURED = MATERIAL | {
     "albedo": CHECKS,
     "alpha_bottom": {"type": "checkerboard", "color0": 0.1, "color1": 0.4},
 }
-# A ball, or a plate, under a bright sky and a lamp, which fills the picture. Prints the mean colours of renderings
-# of each BSDF.
+# Renders a ball or a plate, which fills the picture, under a sky and a bright lamp. Prints the mean colour of each
+# rendering of each BSDF, and whether the BSDF is anisotropic.
 PICTURES = """
     spp, count, shape, *bsdfs = words
     for seed, bsdf in enumerate(bsdfs):
@@ -48,7 +48,7 @@ def cache():
 
 
 def parsed(lines):
-    """Mean colours (renderings, 3) of each BSDF."""
+    """Returns an array (renderings, 3) of mean colours for each BSDF."""
     return [np.array(json.loads(line)) for line in lines if line.startswith("[[")]
 
 
@@ -57,7 +57,10 @@ def pictures(variant, spp, *bsdfs):
 
 
 def agree(a, b):
-    """Means of two sets of six within 4.5 standard errors and 0.1 %: a false alarm in some ten thousand."""
+    """Returns whether the means of two sets of six renderings agree within 4.5 standard errors plus 0.1 %.
+
+    A false alarm happens in about one of ten thousand comparisons.
+    """
     error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 6)
     return (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4.5 * error + 1e-3 * b.mean(axis=0)).all()
 
@@ -70,12 +73,12 @@ def test_scalar_and_vectorised_plugins_render_the_same():
     for mine, other in zip(scalar, vectorised, strict=False):
         assert agree(mine, other), (mine.mean(axis=0), other.mean(axis=0))
     assert agree(scalar[-1], vectorised[0])
-    # Materials differ by more than that: the comparison can fail.
+    # Other materials differ by more than that, so the comparison can fail.
     assert not agree(scalar[0], vectorised[2])
 
 
-def test_anisotropic_adapters_render_the_same_in_both(tmp_path):
-    """And otherwise than one that is blind to the azimuth."""
+def test_scalar_and_vectorised_plugins_render_anisotropic_adapters_the_same(tmp_path):
+    """Both plugins render the same picture. It differs from that of an adapter that ignores the azimuth."""
     adapter = random_anisotropic_adapter()
     (matrix, bias), *rest = adapter.layers
     blind = dataclasses.replace(adapter, layers=[(matrix * np.float32([1, 0, 0, 0, 0]), bias), *rest])
@@ -99,12 +102,15 @@ def mask(opacity, bsdf):
     return {"type": "mask", "opacity": opacity, "inside": bsdf}
 
 
-def test_composites_are_the_linear_combinations_of_what_they_hold():
-    """Of a plate before the sky. Z-tests of 24 means within 5 standard errors, estimated from 32 renderings: a false
-    alarm in two thousand."""
+def test_composites_are_linear_combinations_of_their_parts():
+    """The picture of a composite is the weighted mean of the pictures of its parts, for a plate before the sky.
+
+    Z-tests of 24 means allow 5 standard errors, estimated from 32 renderings: a false alarm in two thousand runs. A
+    failure means that a part inside a composite is evaluated or sampled wrongly.
+    """
     layered, nma, diffuse = {"type": "layered", **MATERIAL}, {"type": "nma", **MATERIAL}, {"type": "diffuse"}
     flat = {"type": "normalmap", "normalmap": {"type": "srgb", "color": [0.5, 0.5, 1.0]}}
-    # Each with what it holds of layered, nma, diffuse and the sky.
+    # Each composite has the shares that layered, nma, diffuse and the sky contribute to its picture.
     composites = {
         "blend": (blend(0.3, layered, diffuse), (0.7, 0, 0.3, 0)),
         "mask": (mask(0.6, layered), (0.6, 0, 0, 0.4)),
@@ -128,7 +134,10 @@ def test_composites_are_the_linear_combinations_of_what_they_hold():
 
 
 def test_diffuse_reflectance_is_the_directional_albedo(tmp_path):
-    """Against means of 20,000 samples; the same for equal arguments, at most 1, and none from behind."""
+    """The diffuse reflectance of a BSDF is its albedo at wi: the mean weight of 20,000 samples, within a tolerance.
+
+    It is the same for equal arguments, at most 1, and 0 from behind.
+    """
     random_anisotropic_adapter().save(tmp_path / "brushed.safetensors")
     finished(
         """
@@ -150,7 +159,7 @@ def test_diffuse_reflectance_is_the_directional_albedo(tmp_path):
     )
 
 
-def test_the_executable_renders_a_scene(cache, tmp_path):
+def test_mitsuba_s_executable_renders_a_scene_with_the_plugin(cache, tmp_path):
     executable = Path(sys.executable).parent / "mitsuba"
     inputs = "".join(
         f'<rgb name="{k}" value="{", ".join(map(str, v["value"]))}"/>'

@@ -1,4 +1,4 @@
-"""The preview scene: geometry, framing, keys, lights, textures, and the measuring of renders."""
+"""The preview scene: geometry, framing, parameter names, lights and textures. Also the measuring of renders."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def textures():
 
 
 def test_shader_ball_is_closed(ball):
-    """Every edge belongs to exactly two triangles, once the seam of the texture coordinates is sewn up."""
+    """Every edge belongs to exactly two triangles, after vertices along the seam of the texture are merged."""
     _, index = np.unique(np.round(ball.vertices, 6), axis=0, return_inverse=True)
     corners = index.reshape(-1)[ball.faces]
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
@@ -66,7 +66,7 @@ def test_shader_ball_file_is_written_once():
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_material_covers_forty_percent(name):
-    """Measured: hero .446, close .86, top .63; and the share hardly depends on the resolution."""
+    """The material covers at least 40 % of the picture, at any resolution. Measured: hero .446, close .86, top .63."""
     coverage = material_coverage((256, 256), name)
     assert coverage >= 0.40
     assert material_coverage((64, 64), name) == pytest.approx(coverage, abs=0.01)
@@ -87,7 +87,7 @@ def test_parameters_keep_their_names():
 
 @pytest.mark.parametrize("lighting", LIGHTINGS)
 def test_picture_is_well_exposed(lighting):
-    """Mean luminance near middle grey, few pixels beyond white, no dead pixel."""
+    """The mean is near middle grey, few pixels are brighter than white, and no pixel is NaN or negative."""
     image = render(preview_scene(GREY, size=(64, 64), lighting=lighting), 32)
     assert np.isfinite(image).all()
     assert image.min() >= 0.0
@@ -118,7 +118,7 @@ def test_gradient_reaches_the_material_under_prb():
 
 
 def test_envmap_replaces_all_lights_and_stands_upright(tmp_path: Path):
-    """Blue above, red below: a floor without the ball on it turns blue only."""
+    """With a map that is blue above and red below, the bare floor is lit blue. A red floor means an inverted map."""
     sky = np.zeros((16, 32, 3), dtype=np.float32)
     sky[:8, :, 2] = 1.0
     sky[8:, :, 0] = 1.0
@@ -151,8 +151,8 @@ def test_wrong_options_are_refused(options):
         preview_scene(GREY, **options)
 
 
-def test_environment_maps_that_are_none_are_refused_by_name(tmp_path):
-    """Pictures of NaN, after all the work, said nothing of the map."""
+def test_unreadable_environment_maps_are_refused_by_name(tmp_path):
+    """A map that is no image or holds NaN is refused before rendering, so that no picture of NaN is rendered."""
     sky = np.ones((4, 8, 3), np.float32)
     sky[1, 2] = np.nan
     (tmp_path / "text.exr").write_text("sky")
@@ -164,7 +164,7 @@ def test_environment_maps_that_are_none_are_refused_by_name(tmp_path):
             preview_scene(GREY, envmap=path)
 
 
-def test_camera_and_integrator_may_be_given_whole():
+def test_camera_and_integrator_may_be_given_as_objects():
     camera = Camera((0.0, -3.0, 1.0), (0.0, 0.0, 1.0), 20.0)
     scene = preview_scene(GREY, camera=camera, integrator={"type": "direct"}, size=(4, 4))
     assert scene["sensor"]["fov"] == 20.0
@@ -189,7 +189,7 @@ def test_textures_depend_on_the_seed_alone(textures):
 
 
 def test_textures_tile(textures):
-    """The step across the border is no larger than steps inside are."""
+    """The difference of pixels across the border is no larger than differences of neighbours inside."""
     for texture in textures.values():
         for axis in (0, 1):
             inside = np.abs(np.diff(texture, axis=axis)).mean(axis=1 - axis)
@@ -197,7 +197,7 @@ def test_textures_tile(textures):
             assert (border <= 1.5 * inside.max(axis=0)).all()
 
 
-def test_textures_of_useless_size_are_refused():
+def test_textures_of_too_few_pixels_are_refused():
     with pytest.raises(TextureError):
         procedural_textures(8)
 
@@ -207,7 +207,7 @@ def test_bitmap_texture_keeps_values(textures):
     np.testing.assert_array_equal(np.array(mi.traverse(texture)["data"])[..., 0], textures["alpha_bottom"])
 
 
-def test_measure_is_mean_and_variance_over_seeds():
+def test_measure_returns_mean_and_variance_over_seeds():
     scene = mi.load_dict(preview_scene(GREY, size=(12, 12)))
     result = measuring.measure(scene, 4, [3, 5, 9], warmup=False)
     runs = np.stack([measuring.render_seconds(scene, 4, seed)[0] for seed in (3, 5, 9)])
@@ -226,7 +226,10 @@ def test_measure_wants_different_seeds(seeds):
 
 
 def test_ztest_false_alarms_are_as_stated():
-    """400 pairs of equal noisy images, false alarm rate 5 %: 20 expected, 6 to 38 in 99.98 % of all cases."""
+    """Of 400 pairs of images with equal means, the Z-test at a false-alarm rate of 5 % rejects about 20.
+
+    With fresh seeds, 6 to 38 pairs are rejected in 99.98 % of all runs.
+    """
     rng = np.random.default_rng(1)
     alarms = 0
     for _ in range(400):
@@ -237,7 +240,10 @@ def test_ztest_false_alarms_are_as_stated():
 
 
 def test_ztest_of_renders_accepts_equal_and_rejects_two_percent_of_energy():
-    """A 24 x 24 picture, 12 runs of 32 samples on either side. False alarm 1 % before fixing the seeds."""
+    """The Z-test accepts two sets of 12 renders of one scene, and rejects one set that is 2 % brighter.
+
+    Each render has 24 x 24 pixels and 32 samples per pixel. The false-alarm rate is 1 %; seeds are fixed.
+    """
     scene = mi.load_dict(preview_scene(GREY, size=(24, 24)))
     one = measuring.measure(scene, 32, range(12), warmup=False)
     two = measuring.measure(scene, 32, range(100, 112), warmup=False)
@@ -260,7 +266,7 @@ def test_ztest_handles_images_without_noise():
 
 
 @pytest.mark.parametrize("fault", ["shape", "nan", "block"])
-def test_ztest_refuses(fault):
+def test_ztest_refuses_images_that_cannot_be_compared(fault):
     image, block = np.ones((4, 4, 3)), 8 if fault == "block" else 1
     other = {"shape": np.ones((4, 5, 3)), "nan": np.full((4, 4, 3), np.nan)}.get(fault, image)
     with pytest.raises(ImageError):
@@ -271,7 +277,7 @@ def render(scene: dict, spp: int) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=0))
 
 
-def test_without_a_variant_it_says_what_to_call(monkeypatch):
+def test_the_scene_without_a_variant_says_what_to_call(monkeypatch):
     monkeypatch.setattr(mi, "variant", lambda: None)
     with pytest.raises(ParamError, match=r"nma\.render\.use\(\)"):
         preview_scene(GREY)

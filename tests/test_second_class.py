@@ -1,4 +1,4 @@
-"""A second class of materials is its parameters, its source and a line in each registry; everything else follows."""
+"""A second class of materials needs its parameters, a source and one line in each registry. No other code changes."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ MATERIAL = 'title = "Steel"\ndescription = "Bare."\nclass = "bare"\n[parameters]
 
 
 class Bare(Layered3):
-    """A stack of which two parameters vary."""
+    """A stack of layers of which only two parameters vary."""
 
     space = BARE
 
@@ -35,7 +35,7 @@ class Bare(Layered3):
 
 @pytest.fixture
 def bare(monkeypatch, tmp_path):
-    """The class in its registries, and a material of it as a file."""
+    """The path of a material file of the class `bare`, which this fixture adds to the registries."""
     monkeypatch.setitem(SPACES, "bare", BARE)
     monkeypatch.setitem(sources._FACTORIES, "bare", Bare)
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""An adapter of one material of a class knows which: it needs no parameters, and refuses those of another."""
+"""An adapter of one material records its parameters. It needs none, and refuses those of another material."""
 
 import json
 import math
@@ -25,7 +25,7 @@ GOLD = materials.load("gold-red-lacquer")
 
 
 def of_gold(**record):
-    """An adapter that says it was fitted to gold under red lacquer; what it shows is arbitrary."""
+    """Returns an adapter whose record names gold under red lacquer. Its appearance is arbitrary."""
     adapter = random_adapter(hidden="1x8", name="direction")
     return replace(adapter, training={"material": GOLD.name, "params": GOLD.vector().tolist(), **record})
 
@@ -38,20 +38,20 @@ def weights(tmp_path_factory):
 
 
 def values(description):
-    """What a BSDF says of some pairs of directions."""
+    """Evaluates a BSDF for three pairs of directions."""
     bsdf, si = load_dict(description), mi.SurfaceInteraction3f()
     si.wi = mi.Vector3f(0.6, 0.0, 0.8)
     wo = mi.Vector3f([0.0, 0.6, -0.6], [0.6, 0.0, 0.0], 0.8)
     return np.array(bsdf.eval(mi.BSDFContext(), si, wo))
 
 
-def test_the_weights_say_which_material_they_know(weights):
+def test_the_weights_file_records_its_material(weights):
     np.testing.assert_array_equal(Adapter.load(weights).material, GOLD.vector())
-    assert random_adapter().material is None  # of a class
-    assert random_adapter(name="direction").material is None  # from before weights said so
+    assert random_adapter().material is None  # an adapter of a whole class
+    assert random_adapter(name="direction").material is None  # a file from before materials were recorded
 
 
-def test_only_that_material_is_known_to_rounding(weights):
+def test_only_the_recorded_material_is_accepted_up_to_rounding(weights):
     adapter, vector = Adapter.load(weights), GOLD.vector()
     np.testing.assert_allclose(adapter.check(vector.astype(np.float32)), vector[None], rtol=1e-6)
     other = vector.copy()
@@ -65,13 +65,13 @@ def test_only_that_material_is_known_to_rounding(weights):
 @pytest.mark.parametrize(
     "params", [[], [1.0], [[1.0] * 13], ["a"] * 13, {"a": 1}, [-1.0] * 13, [math.nan] * 13]
 )
-def test_a_record_of_no_material_of_the_class_is_refused(tmp_path, params):
+def test_a_record_that_is_no_material_of_the_class_is_refused(tmp_path, params):
     of_gold(params=params).save(tmp_path / "a.safetensors")
     with pytest.raises(WeightsError, match="a.safetensors: its material is none of class layered3"):
         Adapter.load(tmp_path / "a.safetensors")
 
 
-def test_as_a_source_it_needs_no_parameters(weights):
+def test_the_source_of_an_adapter_needs_no_parameters(weights):
     adapter, wo_wi = Adapter.load(weights), pairs(50)
     own = numbers(AdapterValues(adapter).eval(*wo_wi))
     assert own.max() > 0
@@ -85,7 +85,7 @@ def test_as_a_source_it_needs_no_parameters(weights):
     [{"material": "gold-red-lacquer"}, {"alpha_top": 0.005}, material_bsdf(GOLD), {"clamp": True}],
     ids=["by name", "a number of it", "all of it", "clamped"],
 )
-def test_the_bsdf_needs_no_parameters_and_takes_its_own(weights, given):
+def test_the_bsdf_needs_no_parameters_and_accepts_the_recorded_ones(weights, given):
     alone = values({"type": "nma", "adapter": str(weights)})
     assert alone.min() > 0
     np.testing.assert_array_equal(values({**given, "type": "nma", "adapter": str(weights)}), alone)
@@ -112,14 +112,14 @@ def test_the_bsdf_refuses_another_material(weights, given, message):
         load_dict({"type": "nma", "adapter": str(weights), **given})
 
 
-def test_a_material_beyond_the_training_range_of_its_class_is_known_too(tmp_path):
+def test_a_recorded_material_may_lie_beyond_the_training_range_of_its_class(tmp_path):
     vector = GOLD.vector()
     vector[-1] = 3.0
     of_gold(params=vector.tolist()).save(tmp_path / "thick.safetensors")
     assert values({"type": "nma", "adapter": str(tmp_path / "thick.safetensors"), "sigma_t": 3.0}).min() > 0
 
 
-def test_nma_render_shows_it_alone_and_refuses_it_for_another(nma, weights, tmp_path):
+def test_nma_render_shows_an_adapter_alone_and_refuses_another_material(nma, weights, tmp_path):
     options = ("--size", "8", "--spp", "1")
     for subject in ((weights,), ("gold-red-lacquer", "--adapter", weights)):
         code, _, err = nma("render", *subject, "-o", tmp_path / f"{len(subject)}.exr", *options)
@@ -131,7 +131,7 @@ def test_nma_render_shows_it_alone_and_refuses_it_for_another(nma, weights, tmp_
     assert not (tmp_path / "no.exr").exists()
 
 
-def test_nma_render_wants_a_material_for_the_adapter_of_a_class(nma, tmp_path):
+def test_nma_render_needs_a_material_for_the_adapter_of_a_class(nma, tmp_path):
     random_adapter(hidden="1x8").save(tmp_path / "class.safetensors")
     code, _, err = nma("render", tmp_path / "class.safetensors", "-o", tmp_path / "no.exr")
     assert code == 1
@@ -139,7 +139,7 @@ def test_nma_render_wants_a_material_for_the_adapter_of_a_class(nma, tmp_path):
 
 
 @pytest.mark.slow
-def test_nma_compare_renders_the_simulation_of_the_material_that_an_adapter_knows(nma, weights, tmp_path):
+def test_nma_compare_simulates_the_recorded_material(nma, weights, tmp_path):
     options = ("--size", "16", "--spp", "2", "--json")
     alone = nma("compare", weights, *options)
     assert alone[0] == 0, alone[2]

@@ -1,4 +1,4 @@
-"""The target against Mitsuba's `principled`, against its own laws, and across array libraries and precisions."""
+"""The target equals Mitsuba's `principled`, obeys its laws, and computes the same in all libraries and precisions."""
 
 import warnings
 
@@ -22,7 +22,7 @@ SINGLE_EPS = 2.0**-24
 
 
 def to_single(tree):
-    """Rounded to single precision, kept in double: what single-precision code is given, exactly."""
+    """Rounds to single precision and converts back to double, so that both precisions get exactly the same inputs."""
     return mapped(tree, lambda x: x.astype(np.float32).astype(np.float64))
 
 
@@ -31,7 +31,7 @@ def drjit_single(tree):
 
 
 def lobe_directions(rng, blend, wi):
-    """One direction per lane drawn from the blend itself, kept above the horizon by a second, uniform draw."""
+    """Samples one direction per lane from the blend. Random directions replace those below the horizon."""
     wo, _, _ = target.sample(blend, wi, *rng.random((3, wi.z.size)))
     fallback = random_directions(rng, wi.z.size)
     return ops.select(wo.z > 1e-6, wo, fallback)
@@ -41,7 +41,7 @@ def lobe_directions(rng, blend, wi):
 
 
 class Oracle:
-    """Mitsuba's `principled` with n parameter sets at once: textures with one texel per set."""
+    """Mitsuba's `principled` with n parameter sets at once. Its textures have one texel per set."""
 
     def __init__(self, p: Principled):
         mi.set_variant("llvm_ad_rgb")
@@ -76,17 +76,19 @@ class Oracle:
 
 
 def test_eval_equals_mitsuba_principled():
-    """1e-4 relative over 10,000 parameter sets, half of the directions drawn from the lobes, alpha down to .001.
+    """Our values equal Mitsuba's within 1e-4 relative, for 10,000 parameter sets with alpha down to .001.
 
-    Two allowances for what single precision does to Mitsuba's side: its clearcoat holds 1 + (alpha^2 - 1) cos^2, so
-    this lobe is uncertain by a few rounding errors over that sum; and where both directions graze and are opposite but
-    for a hundredth, its cosine to the half vector loses digits: 2e-3 there. Closer than .001 to the horizon that cosine
-    may even be negative, and Mitsuba returns zero: not compared.
+    Half of the directions are sampled from the lobes. Mitsuba computes in single precision, so that two cases are
+    allowed a larger difference. Its clearcoat contains the sum 1 + (alpha^2 - 1) cos^2, so that this lobe may be wrong
+    by a few rounding errors over that sum. If the two directions graze and are opposite within a hundredth, the cosine
+    to the half vector loses digits, and 2e-3 is allowed. Directions closer than .001 to the horizon are not compared:
+    there this cosine may be negative, and Mitsuba returns zero. A failure means that our formulas differ from
+    Mitsuba's.
     """
     rng = np.random.default_rng(11)
     n = 10_000
     p = to_single(random_principled(rng, n))
-    # A tenth each at and below the floor of alpha.
+    # A tenth of the sets have alpha at its lower bound of .001, and a tenth have it below.
     floor = rng.random(n)
     rough = np.where(floor < 0.1, np.sqrt(np.float32(0.001)), np.where(floor > 0.9, 0.01, p.roughness))
     p = p._replace(roughness=rough.astype(np.float32).astype(np.float64))
@@ -111,15 +113,16 @@ def test_eval_equals_mitsuba_principled():
         plain = (allowance < 1e-5 * np.abs(value)) & ~opposite
         worst = max(worst, np.max((error / (np.abs(value) + 1e-9))[plain]))
         allowed += np.sum(~plain.all(axis=0))
-    # Where the allowance plays no part, which is nearly everywhere, the agreement is that of single precision.
+    # In at least 92 % of the cases no allowance matters, and the values agree within single precision.
     assert allowed < 0.08 * 16 * n
     assert worst < 2e-5
 
 
 @pytest.mark.parametrize("gloss", (0.0, 0.3, 0.9, 1.0))
 def test_clearcoat_distribution_is_normalised(gloss):
-    # The part of the oracle that single precision spoils: int D cos(theta_h) dm = 1 pins its scale. In s = sin^2 the
-    # integrand is pi D, and log(s + alpha^2) spreads its peak evenly.
+    # Single precision spoils the comparison of clearcoats with Mitsuba, so that this integral tests their scale:
+    # int D cos(theta_h) dm = 1. As a function of s = sin^2 the integrand is pi D. The variable x = log(s + alpha^2)
+    # spreads its peak evenly.
     alpha = clearcoat_alpha(gloss)
     low, high = np.log(alpha**2), np.log(1 + alpha**2)
     x = low + (high - low) * (np.arange(20_000) + 0.5) / 20_000
@@ -142,7 +145,7 @@ def test_reciprocity(n_instances):
     np.testing.assert_allclose(there, back, rtol=1e-9)
 
 
-def test_below_the_horizon_all_is_zero():
+def test_values_and_densities_are_zero_below_the_horizon():
     rng = np.random.default_rng(13)
     blend = random_blend(rng, 1000, 2)
     wi, wo = random_directions(rng, 1000), random_directions(rng, 1000)
@@ -156,7 +159,7 @@ def test_below_the_horizon_all_is_zero():
     assert not np.any(pdf)
 
 
-def test_blend_weighs_its_instances():
+def test_a_blend_is_the_weighted_sum_of_its_instances():
     rng = np.random.default_rng(14)
     blend = random_blend(rng, 1000, 3)
     wi, wo = random_directions(rng, 1000), random_directions(rng, 1000)
@@ -170,13 +173,16 @@ def test_blend_weighs_its_instances():
 
 
 def test_ten_million_evaluations_are_finite_and_not_negative():
-    """Random and extreme parameters, random and grazing directions, single precision; `eval_pdf` and `sample`."""
+    """`eval_pdf` and `sample` return finite values of at least 0 in single precision.
+
+    Parameters are random or extreme, and directions are random or grazing.
+    """
     Float = dr.llvm.Float
     n = 5_000_000
     rng = dr.llvm.PCG32(size=n, initstate=15)
 
     def number(low=0.0, high=1.0):
-        # A quarter of all numbers lie at the ends of their range.
+        # About a quarter of all values lie at an end of their range.
         u = rng.next_float32()
         return low + (high - low) * dr.clip(1.3 * u - 0.15, 0.0, 1.0)
 
@@ -204,13 +210,13 @@ def test_ten_million_evaluations_are_finite_and_not_negative():
     for x in results:
         assert dr.all(dr.isfinite(x) & (x >= 0.0))
     assert all(dr.all(dr.isfinite(Float(x))) for x in sampled)
-    # Whatever reflects can be sampled.
+    # Every direction that reflects light can be sampled.
     assert dr.all((pdf > 0) | (value.x + value.y + value.z == 0))
 
 
 @pytest.mark.slow
 def test_derivatives_are_finite_everywhere():
-    """Extreme raw outputs and degenerate pairs of directions; derivatives to everything, in single precision."""
+    """Derivatives are finite in single precision for extreme raw outputs and degenerate pairs of directions."""
     rng = np.random.default_rng(16)
     s = float(np.sqrt(0.5))
     special = [
@@ -238,7 +244,7 @@ def test_derivatives_equal_finite_differences():
     rng = np.random.default_rng(17)
     with jax.enable_x64(True), warnings.catch_warnings():
         raw = jnp.asarray(rng.normal(size=(300, 23)))
-        # Directions move along the sphere: by their cosine and azimuth, away from the horizon.
+        # Finite differences vary the cosine and the azimuth of each direction. Directions stay above the horizon.
         cosines, phis = rng.uniform(0.05, 0.95, (2, 300)), rng.uniform(0, 6, (2, 300))
         near = rng.random(300) < 0.5
         cosines[1] = np.where(near, np.clip(cosines[0] + rng.normal(size=300) * 0.02, 0.05, 0.99), cosines[1])
@@ -267,7 +273,10 @@ def test_derivatives_equal_finite_differences():
 
 
 def test_single_precision_keeps_its_digits():
-    """Dr.Jit and JAX in single precision against NumPy in double, on the same (rounded) inputs, peaks included."""
+    """Dr.Jit and JAX in single precision equal NumPy in double precision within 2e-5 relative, also in the peaks.
+
+    All get the same inputs, which are rounded to single precision.
+    """
     rng = np.random.default_rng(18)
     n = 100_000
     blend = to_single(random_blend(rng, n, 2))
@@ -294,6 +303,6 @@ def test_samples_are_the_same_in_every_library():
     u = to_single(tuple(rng.random((3, n))))
     expected = stacked(target.sample(blend, wi, *u)[0])
     from_drjit = stacked(target.sample(drjit_single(blend), drjit_single(wi), *drjit_single(u))[0])
-    # A number within rounding of a lobe's border may choose the neighbour.
+    # A random number within a rounding error of the border between two lobes may choose either lobe.
     close = np.abs(from_drjit - expected).max(axis=0) < 1e-4
     assert close.mean() > 0.999

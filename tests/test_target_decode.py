@@ -1,4 +1,4 @@
-"""Raw network outputs to blends and back."""
+"""Decoding of raw network outputs to blends, and encoding of blends to raw outputs."""
 
 import math
 
@@ -57,7 +57,7 @@ def test_any_raw_output_is_a_valid_blend(n_instances):
         assert p.flatness == 0.0
 
 
-def test_middle_and_scale():
+def test_a_raw_output_of_zero_is_the_middle_of_its_range():
     blend = decode([0.0] * 23, 2)
     p = blend.instances[0]
     assert p.base_color == Vec3(0.5, 0.5, 0.5)
@@ -66,7 +66,7 @@ def test_middle_and_scale():
     assert blend.weights == (0.5, 0.5)
 
 
-def test_blend_weighs_the_first_instance():
+def test_the_blend_weight_is_that_of_the_first_instance():
     assert decode([0.0] * 22 + [30.0], 2).weights[0] == pytest.approx(1.0)
     assert decode([0.0] * 22 + [-30.0], 2).weights[1] == pytest.approx(1.0)
 
@@ -91,12 +91,12 @@ def test_encode_is_finite_at_the_ends_of_ranges():
     raw = encode(Blend((p, p), (1.0, 0.0)))
     assert np.all(np.isfinite(raw))
     assert decode(raw, 2).instances[0].metallic == pytest.approx(1.0, abs=1e-5)
-    # The first weight leaves nothing to break.
+    # The first weight of 1 leaves a rest of 0 for the other two, whose split is then undefined.
     assert np.all(np.isfinite(encode(Blend((p, p, p), (1.0, 0.0, 0.0)))))
 
 
 @pytest.mark.parametrize("n_instances", (1, 2, 4))
-def test_numbers_round_trip(n_instances):
+def test_a_blend_is_the_same_after_conversion_to_numbers_and_back(n_instances):
     blend = decode(raw_outputs(n_instances), n_instances)
     flat = numbers(blend)
     assert len(flat) == output_size(n_instances)
@@ -118,12 +118,12 @@ def test_lists_of_another_length_are_refused(length):
 
 
 @pytest.mark.parametrize("params", (FULL, STRETCHED_PARAMS))
-def test_declarations_survive_a_weights_file(params):
+def test_declarations_are_the_same_after_conversion_to_json_and_back(params):
     assert params_from_json(params_to_json(params)) == params
 
 
 def test_stretching_fades_towards_normal_incidence():
-    """By sin^2(theta_i), and nothing else does."""
+    """Anisotropy is scaled by sin^2(theta_i). No other parameter depends on the cosine."""
     raw = raw_outputs(2, params=STRETCHED_PARAMS)
     full, half, none = (
         decode(raw, 2, STRETCHED_PARAMS, mu).instances[0] for mu in (0.0, math.sqrt(0.5), 1.0)
@@ -152,7 +152,7 @@ def test_senseless_declarations_are_refused(entry):
         params_from_json([entry])
 
 
-def test_jax_decodes_the_same():
+def test_jax_decodes_to_the_same_numbers_as_numpy():
     raw = raw_outputs(2)
     expected = np.stack(numbers(decode(raw, 2)))
     decoded = np.stack(

@@ -1,4 +1,4 @@
-"""The frame of the plane of incidence: a turn about the normal, the same on every library."""
+"""The frame of the plane of incidence is a rotation about the normal. `enter` rotates into it, `leave` back."""
 
 import numpy as np
 

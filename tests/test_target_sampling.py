@@ -1,7 +1,8 @@
-"""Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and of the estimates behind its odds.
+"""Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and tests of the odds of the lobes.
 
-In double precision: at grazing angles the narrowest lobes are 1e-5 wide, and bins within them would count the rounding
-of single-precision directions. That single precision draws the same directions is tested with the target itself.
+The tests compute in double precision. At grazing angles the narrowest lobes are 1e-5 wide, and in single precision the
+rounding of directions would change the counts of such narrow bins. test_target.py tests that both precisions draw the
+same directions.
 """
 
 import drjit as dr
@@ -20,22 +21,25 @@ from nma.target.sampling import sample_clearcoat, sample_diffuse, sample_spec
 ensure_llvm()
 
 N_BLENDS = 200
-DEPTH = 7  # 128 bins per blend ...
-FINE = 10  # ... each integrated over 8 parts at least
+DEPTH = 7  # 2^7 = 128 bins per blend
+FINE = 10  # 2^10 boxes per blend: each bin is integrated over at least 8
 PILOT = 1 << 13
 SAMPLES = 100_000
-FAMILY_ERROR = 1e-3  # chance that a correct sampler fails one of the 200 tests
+FAMILY_ERROR = 1e-3  # the chance that a correct sampler fails at least one of the 200 tests
 SIDAK = 1 - (1 - FAMILY_ERROR) ** (1 / N_BLENDS)
 
 
-# ---- A chart of the hemisphere: 1 - cos(theta) and azimuth, both relative to the mirror direction and both through
-# ---- asinh, so that the narrowest lobes and their tails over many decades are equally smooth.
+# ---- A chart of the hemisphere. Its coordinates are 1 - cos(theta) and the azimuth, both relative to the mirror
+# ---- direction and both mapped by asinh. So the narrowest lobes are as smooth as their tails over many decades.
 
 EPSILON = 1e-7
 
 
 def to_chart(w, mirror):
-    """Chart coordinates (a, b) of directions; 1 - cos comes from x and y, which keep their digits near the pole."""
+    """Returns the chart coordinates (a, b) of directions.
+
+    1 - cos(theta) is computed from x and y, which keep their digits near the pole.
+    """
     t = (w.x * w.x + w.y * w.y) / (1.0 + w.z)
     phi = dr.atan2(w.y, w.x) - mirror[1]
     phi = phi - dr.two_pi * dr.round(phi / dr.two_pi)
@@ -43,7 +47,7 @@ def to_chart(w, mirror):
 
 
 def from_chart(a, b, mirror):
-    """The direction at (a, b), and the solid angle per unit of area there."""
+    """Returns the direction at the chart coordinates (a, b), and the solid angle per unit of chart area there."""
     t = dr.clip(mirror[0] + EPSILON * dr.sinh(a), 0.0, 1.0)
     phi = mirror[1] + EPSILON * dr.sinh(b)
     r = dr.safe_sqrt(t * (2.0 - t))
@@ -51,19 +55,19 @@ def from_chart(a, b, mirror):
 
 
 def whole_chart(mirror):
-    """(n, 1, 4) boxes a0, a1, b0, b1 of the hemisphere."""
+    """Returns the boxes (n, 1, 4), each a0, a1, b0, b1, that cover the hemisphere."""
     seam = np.full_like(mirror[0], np.arcsinh(np.pi / EPSILON))
     a0, a1 = (np.arcsinh((t - mirror[0]) / EPSILON) for t in (0.0, 1.0))
     return np.stack([a0, a1, -seam, seam], 1)[:, None]
 
 
 class Cases:
-    """Random blends of 1 to 5 instances, one view direction each, as double-precision tables to gather from."""
+    """Random blends of 1 to 5 instances, with one view direction each, as double-precision arrays."""
 
     def __init__(self, seed, n=N_BLENDS, dialect=True):
         rng = np.random.default_rng(seed)
         blend = random_blend(rng, n, 5, dialect)
-        # Instances beyond a random number get no weight.
+        # Only the first instances, 1 to 5 at random, have a weight.
         used = np.arange(5)[:, None] < rng.integers(1, 6, n)
         weights = np.where(used, stacked(blend.weights) + 1e-3, 0.0)
         self.blend = Blend(blend.instances, tuple(weights / weights.sum(0)))
@@ -73,13 +77,16 @@ class Cases:
         self.mirror = (1 - z, np.arctan2(-self.wi.y, -self.wi.x))
 
     def at(self, Float, index):
-        """Blend, view direction and mirror direction per lane, `index` naming the blend of each."""
+        """Gathers blend, view direction and mirror direction per lane. `index` holds the index of each lane's blend."""
         gather = lambda x: dr.gather(Float, Float(x), index)
         return mapped((self.blend, self.wi, self.mirror), gather)
 
 
 def drawn(cases, count, seed, sampler):
-    """Chart coordinates of what `sampler(blend, wi, lane, u)` draws, `count` lanes for each blend after the other."""
+    """Returns the chart coordinates of the directions that `sampler(blend, wi, lane, u)` draws.
+
+    There are `count` lanes per blend. Lanes are ordered by blend. Invalid samples have a = inf.
+    """
     n = cases.wi.z.size
     lane = dr.arange(dr.llvm.UInt, n * count)
     rng = dr.rng(seed)
@@ -90,7 +97,7 @@ def drawn(cases, count, seed, sampler):
 
 
 def draw(cases, count, seed, alpha_scale=1.0):
-    """Samples of the blends, invalid ones at a = inf; widths of the specular lobes off by a factor on request."""
+    """Draws samples of the blends. `alpha_scale` multiplies the widths of specular lobes, to make samples wrong."""
 
     def sampler(blend, wi, lane, u):
         rough = float(np.sqrt(alpha_scale))
@@ -102,14 +109,14 @@ def draw(cases, count, seed, alpha_scale=1.0):
 
 
 def draw_lobes(cases, count, seed):
-    """Samples of every lobe of every instance in equal shares, whatever its weight; none is invalid."""
+    """Draws equally many samples from every lobe of every instance, independent of weights. All samples are valid."""
 
     def sampler(blend, wi, lane, u):
         wo = sample_diffuse(u[1], u[2])
         for k, (alpha_x, alpha_y, alpha_c) in enumerate(target.lobe_alphas(blend)):
             wo = ops.select(lane % 11 == 2 * k + 1, sample_spec(wi, alpha_x, alpha_y, u[1], u[2]), wo)
             wo = ops.select(lane % 11 == 2 * k + 2, sample_clearcoat(wi, alpha_c, u[1], u[2]), wo)
-        # What falls below the horizon helps nowhere: uniform directions instead.
+        # Samples below the horizon are useless for placing bins. Uniform directions replace them.
         z = u[1]
         r = dr.sqrt(1.0 - z * z)
         uniform = Vec3(r * dr.cos(dr.two_pi * u[2]), r * dr.sin(dr.two_pi * u[2]), z)
@@ -119,7 +126,7 @@ def draw_lobes(cases, count, seed):
 
 
 def adaptive_bins(boxes, a, b):
-    """Cuts `boxes` (n, 1, 4) into (n, 2^FINE, 4) of equal counts of samples; also the cuts that find them."""
+    """Cuts `boxes` (n, 1, 4) into boxes (n, 2^FINE, 4) of equally many samples. Returns them and the cuts per level."""
     n = len(boxes)
     points = np.stack([a.numpy(), b.numpy()], -1).reshape(n, 1, -1, 2)
     cuts = []
@@ -139,7 +146,7 @@ def adaptive_bins(boxes, a, b):
 
 
 def counts(a, b, cuts):
-    """(n, 2^DEPTH + 1) samples per bin, invalid ones last."""
+    """Counts the samples in each bin. The result is (n, 2^DEPTH + 1), and the last column counts invalid samples."""
     n, size, UInt = len(cuts[0]), 2**DEPTH, dr.llvm.UInt
     row = dr.arange(UInt, len(a)) // (len(a) // n)
     node = dr.zeros(UInt, len(a))
@@ -151,7 +158,7 @@ def counts(a, b, cuts):
 
 
 def integrate(cases, index, boxes, order=6):
-    """Integral of the density over boxes (m, 4) by Gauss-Legendre, `index` (m,) naming their blends."""
+    """Integrates the density over boxes (m, 4) by Gauss-Legendre quadrature. Box k belongs to blend `index[k]`."""
     Float, UInt = dr.llvm.Float64, dr.llvm.UInt
     x, w = np.polynomial.legendre.leggauss(order)
     x, w = 0.5 + 0.5 * x, 0.5 * w
@@ -171,7 +178,7 @@ def integrate(cases, index, boxes, order=6):
 
 
 def integrate_adaptively(cases, boxes, tolerance=2e-6):
-    """(n, 2^DEPTH) integrals of the density: boxes are quartered until their parts agree with the whole."""
+    """Returns the integrals (n, 2^DEPTH) of the density. Boxes are quartered until the quarters sum up to the whole."""
     n, bins, _ = boxes.shape
     owner = np.arange(n * bins)
     parts = boxes.reshape(-1, 4)
@@ -194,7 +201,10 @@ def integrate_adaptively(cases, boxes, tolerance=2e-6):
 
 @pytest.fixture(scope="module")
 def bins():
-    """Random blends, the cuts of their bins, and the expected chance of each bin (n, 2^DEPTH + 1), invalid last."""
+    """Random blends, the cuts of their bins, and the probabilities (n, 2^DEPTH + 1) of the bins.
+
+    The last column is the probability of an invalid sample.
+    """
     cases = Cases(seed=31)
     boxes, cuts = adaptive_bins(whole_chart(cases.mirror), *draw_lobes(cases, PILOT, seed=1))
     probability = integrate_adaptively(cases, boxes)
@@ -203,7 +213,7 @@ def bins():
 
 
 def p_values(bins, seed, alpha_scale=1.0):
-    """One chi-square p-value per blend."""
+    """Returns one chi-square p-value per blend."""
     cases, cuts, probability = bins
     observed = counts(*draw(cases, SAMPLES, seed, alpha_scale), cuts)
     expected = np.maximum(probability, 0.0) * SAMPLES
@@ -211,7 +221,7 @@ def p_values(bins, seed, alpha_scale=1.0):
 
 
 def pooled_p_value(observed, expected):
-    """Chi-square with all bins that expect fewer than 5 samples pooled into one."""
+    """Returns the p-value of a chi-square test. All bins that expect fewer than 5 samples are merged into one."""
     small = expected < 5
     observed = np.append(observed[~small], observed[small].sum())
     expected = np.append(expected[~small], expected[small].sum())
@@ -223,7 +233,7 @@ def pooled_p_value(observed, expected):
     return chi2.sf(statistic, len(expected) - 1)
 
 
-def test_densities_integrate_to_the_chance_of_a_valid_sample(bins):
+def test_no_probability_of_a_bin_or_of_an_invalid_sample_is_negative(bins):
     _, _, probability = bins
     assert np.all(probability > -1e-4)
 
@@ -231,20 +241,23 @@ def test_densities_integrate_to_the_chance_of_a_valid_sample(bins):
 def test_samples_follow_their_density(bins):
     p = p_values(bins, seed=2)
     assert p.min() > SIDAK, f"blend {p.argmin()}: p = {p.min():.2e} against {SIDAK:.2e}"
-    # Correct p-values are uniform: neither too bad nor too good to be true.
+    # The p-values of a correct sampler are uniform, so that their median is near .5.
     assert 0.35 < np.median(p) < 0.65
 
 
 @pytest.mark.slow
-def test_an_alpha_off_by_five_per_cent_is_rejected(bins):
+def test_samples_with_alpha_off_by_five_per_cent_are_rejected(bins):
     p = p_values(bins, seed=3, alpha_scale=1.05)
     assert p.min() < SIDAK
-    # Not by one lucky blend: most show it.
+    # More than half of the blends show the error, not only a few by chance.
     assert np.mean(p < SIDAK) > 0.5
 
 
 def test_odds_follow_the_albedos():
-    """Lobes are chosen by about what they reflect, so sample weights hardly vary."""
+    """Each lobe is chosen about as often as its share of the albedo, so that sample weights vary little.
+
+    A failure means that the estimates of the lobes' albedos are poor, and renderings become noisier.
+    """
     cases = Cases(seed=32, dialect=False)
     count = 4096
     lane = dr.arange(dr.llvm.UInt, N_BLENDS * count)
@@ -259,7 +272,7 @@ def test_odds_follow_the_albedos():
     np.testing.assert_allclose(total, 1.0, rtol=1e-5)
 
 
-def test_sampled_values_are_those_of_eval_pdf():
+def test_sample_returns_the_value_and_pdf_of_eval_pdf():
     rng = np.random.default_rng(33)
     blend, wi = random_blend(rng, 1000, 3), random_directions(rng, 1000)
     wo, value, pdf = target.sample(blend, wi, *rng.random((3, 1000)))

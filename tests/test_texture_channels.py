@@ -1,4 +1,4 @@
-"""One channel of a coloured image for a parameter of one number: chosen by name, never by chance."""
+"""A parameter of one number reads one channel of a coloured image. The user must choose the channel by name."""
 
 import mitsuba as mi
 import numpy as np
@@ -9,7 +9,7 @@ import nma.render
 from nma.jit import dr
 
 nma.render.use("llvm_ad_rgb")
-PACKED = (200, 40, 0)  # occlusion, roughness, metalness, as artists pack them
+PACKED = (200, 40, 0)  # the channels of a packed texture: occlusion, roughness, metalness
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +30,7 @@ def bsdf(kind, **changes):
 
 
 @pytest.mark.parametrize("kind", ("nma", "layered"))
-def test_the_chosen_channel_is_the_number(kind, packed):
+def test_the_parameter_is_the_value_of_the_chosen_channel(kind, packed):
     for channel, number in zip("rg", PACKED, strict=False):
         loaded = mi.load_dict(bsdf(kind, alpha_bottom=packed, alpha_bottom_channel=channel))
         columns = loaded.inputs.columns(dr.zeros(mi.SurfaceInteraction3f))
@@ -55,7 +55,7 @@ def test_other_choices_are_refused(kind, packed, channel, message):
         mi.load_dict(bsdf(kind, alpha_bottom=packed, **choice))
 
 
-def test_a_channel_of_what_has_none_is_refused(packed):
+def test_a_channel_is_refused_for_numbers_and_for_colours(packed):
     for changes in ({"alpha_top_channel": "r"}, {"albedo": packed, "albedo_channel": "r"}):
         with pytest.raises(
             RuntimeError, match="chooses a channel of a texture for a parameter of one number"

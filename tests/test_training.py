@@ -1,6 +1,6 @@
-"""Training: runs that start well, repeat bit for bit, survive a kill and end where they should.
+"""Training starts at a plausible blend, repeats bit for bit, resumes after a kill, and reaches a known target.
 
-Few recipes, for each is compiled anew.
+The tests share few recipes, because JAX compiles each recipe anew.
 """
 
 import os
@@ -33,7 +33,7 @@ QUICK = replace(SINGLE, network="1x16", rows=32, bins_per_row=8, points=32, step
 
 @pytest.fixture(scope="module", autouse=True)
 def fast_compile():
-    """Runs here are so short that compiling takes longest."""
+    """Compiles with fewer optimisations, because compiling takes longer than these short runs."""
     with pytest.MonkeyPatch.context() as patch:
         steps = jax.jit(loop._group.__wrapped__, static_argnames=("recipe", "objective"), **FAST_COMPILE)
         patch.setattr(loop, "_group", steps)
@@ -47,7 +47,7 @@ def tables():
 
 @pytest.mark.slow
 def test_a_run_repeats_bit_for_bit(tables):
-    """The first 200 losses, and more, with the same seed; other ones with another seed."""
+    """Two runs with the same seed have the same losses and weights. Another seed draws other batches and weights."""
     first, run = training.train_class(LAYERED3, TINY, tables, {})
     second, again = training.train_class(LAYERED3, TINY, tables, {})
     assert len(run.losses) == len(run.log_losses) == run.step == TINY.steps
@@ -64,7 +64,7 @@ def test_a_run_repeats_bit_for_bit(tables):
 
 
 class Killed(Exception):
-    """Stands for the end of the process."""
+    """Raised in place of the end of the process."""
 
 
 @pytest.mark.parametrize("moment", (150, pytest.param(50, marks=pytest.mark.slow)))
@@ -91,7 +91,7 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(tables, tmp_path, monke
     for a, b in zip(whole.layers, resumed.layers, strict=True):
         np.testing.assert_array_equal(a[0], b[0])
     assert [p.name for p in tmp_path.iterdir()] == ["run.ckpt"]
-    # Finished: nothing is left to do.
+    # Resuming the finished run does no further step.
     _, done = training.train_class(LAYERED3, TINY, tables, {}, checkpoint=checkpoint)
     assert done.losses == expected.losses
 
@@ -120,7 +120,7 @@ def test_a_time_budget_ends_a_run(tables):
 
 @pytest.mark.slow
 def test_a_fit_approaches_what_it_fits():
-    """The table of a target that the network can say exactly: a log loss of less than .003 within 300 steps."""
+    """A fit reaches a log loss below .003 in 300 steps if the network can represent the target of the table exactly."""
     params = LAYERED3.sample(np.random.default_rng(0), 1)
     truth = tabulate_adapter(constant_adapter(BRASS), params)
     adapter, run = training.fit_material(
@@ -141,7 +141,10 @@ def test_a_fit_approaches_what_it_fits():
 
 @pytest.mark.slow
 def test_the_paper_s_preset_runs(tables):
-    """Batches of 1000 bins, 20 uniform points, one pass per bin, raw inputs, Adam with 1e-5."""
+    """The preset `paper` has the settings of the paper, and trains.
+
+    They are batches of 1000 bins, 20 uniform points per bin, raw inputs, and Adam with a learning rate of 1e-5.
+    """
     assert (PAPER.rows, PAPER.bins_per_row, PAPER.points) == (1000, 1, 20)
     assert (PAPER.points_law, PAPER.bins_law, PAPER.loss) == ("uniform", "uniform", "log")
     assert (PAPER.encoding, PAPER.learning_rate, PAPER.average) == ("raw", 1e-5, 0.0)
@@ -150,7 +153,7 @@ def test_the_paper_s_preset_runs(tables):
     assert run.step == 4
     assert np.isfinite(run.losses).all()
     assert run.losses == run.log_losses
-    # 14 inputs (the paper's library has 33) to 3x32 to 23.
+    # This network maps 14 inputs to 23 outputs through 3x32. The paper's library has 33 inputs and 100 codes of 32.
     assert network.parameters(adapter.layers) == 7159 - 3200 - 19 * 32
 
 
@@ -159,7 +162,7 @@ def test_the_paper_s_preset_runs(tables):
     ("instances", "directional"), [(1, False), (2, False), (1, True), (2, True), (5, True)], ids=str
 )
 def test_every_variant_starts_at_a_plausible_blend(tables, instances, directional):
-    """Finite, positive, and of about the tables' brightness."""
+    """The values of an untrained network are finite and at least 0, in every variant."""
     recipe = replace(TINY, instances=instances, directional=directional)
     layers = training.initial_layers(recipe, LAYERED3)
     assert layers[-1][1].shape == (target.output_size(instances),)
@@ -200,7 +203,7 @@ def test_the_plateau_schedule_halves_a_stalled_step():
         ({"schedule": "cosine"}, "schedule is one of onecycle, plateau, constant"),
     ],
 )
-def test_recipes_that_make_no_sense_are_refused(change, message):
+def test_invalid_recipes_are_refused(change, message):
     with pytest.raises(NmaError, match=message):
         replace(CLASS, **change)
 
@@ -231,7 +234,7 @@ sys.meta_path.insert(0, Block())
 
 
 @pytest.mark.parametrize("missing", ("jax", pytest.param("optax", marks=pytest.mark.slow)))
-def test_without_jax_or_optax_the_user_learns_what_to_install(missing, tmp_path):
+def test_without_jax_or_optax_the_error_says_what_to_install(missing, tmp_path):
     code = BLOCKED.format(missing=missing) + "from nma.cli import main; main()"
     options = ("fit", "gold-red-lacquer", "-o", str(tmp_path / "gold.safetensors"), "--walks", "40")
     result = subprocess.run(

@@ -1,6 +1,6 @@
-"""Batches of training: fair draws of bins, streams of fresh materials, and the thread that prepares them.
+"""Training batches: unbiased draws of bins, streams of new materials, and the thread that prepares batches.
 
-Statistical tests share the false-alarm rate `FALSE_ALARM`; seeds are fixed.
+Each statistical test has the false-alarm rate `FALSE_ALARM`. Seeds are fixed.
 """
 
 import math
@@ -29,7 +29,10 @@ def tables():
 @pytest.mark.parametrize("law", ("mirror", "uniform"))
 @pytest.mark.parametrize("count", (1, 8))
 def test_weights_undo_the_choice_of_bins(law, count):
-    """Weighted means of functions of the bin are those of a uniform choice, in every row (Z-tests)."""
+    """Weighted means over drawn bins equal means over uniform bins, in every row (Z-tests).
+
+    All Z-tests of a case share the false-alarm rate `FALSE_ALARM`. A failure means that training prefers some bins.
+    """
     sampler, rng, n = BinSampler(law), np.random.default_rng(7), 20_000
     for row in (0, 20, 39):
         rows = np.full(n, row)
@@ -54,7 +57,7 @@ def test_weights_undo_the_choice_of_bins(law, count):
     assert (near > 0.1) == (law == "mirror")
 
 
-def test_a_batch_is_what_the_tables_say(tables):
+def test_a_batch_holds_the_values_of_the_tables(tables):
     batch = batch_of(tables, TINY, 3)
     pool = Pool.of(tables)
     m = [int(np.argmax((pool.params == c).all(axis=1))) for c in batch.columns.T]
@@ -64,7 +67,7 @@ def test_a_batch_is_what_the_tables_say(tables):
     )
     assert ((batch.mu * 40 >= batch.i - 1e-5) & (batch.mu * 40 <= batch.i + 1 + 1e-5)).all()
     assert ((batch.shift >= 0) & (batch.shift < 1)).all()
-    # One walk of throughput 1 of those in its row, over the bin's solid angle (eq. 9).
+    # The quantum is the contribution of one walk of throughput 1: 1 / (walks per row x solid angle of a bin), eq. 9.
     np.testing.assert_allclose(batch.quantum, 1.0 / (819_200 / 40 * ISOTROPIC.solid_angle), rtol=1e-6)
     assert all(x.dtype == np.float32 for x in batch)
     again = batch_of(tables, TINY, 3)
@@ -74,7 +77,10 @@ def test_a_batch_is_what_the_tables_say(tables):
 
 
 def test_weights_undo_the_choice_of_anisotropic_bins():
-    """The same over the azimuths of both directions; half of the bins lie around the mirror direction."""
+    """Weighted means over drawn bins equal means over uniform bins also for anisotropic tables (Z-tests).
+
+    Their rows depend on cosine and azimuth of `wi`. Half of the bins are drawn around the mirror direction.
+    """
     grid, rng, n = Grid(theta_i=10, theta_o=20, phi_o=40, phi_i=20), np.random.default_rng(8), 20_000
     sampler = BinSampler("mirror", grid)
     for row, turn in ((0, 0), (4, 13), (9, 19)):
@@ -88,8 +94,8 @@ def test_weights_undo_the_choice_of_anisotropic_bins():
         assert there.mean() > 10 / 800
 
 
-def test_albedos_within_a_row_follow_its_neighbours(tables):
-    """Exact for albedos linear in the cosine; the mean over a row stays the table's, whatever the albedo."""
+def test_albedos_within_a_row_are_interpolated(tables):
+    """`albedo_at` is exact for albedos that are linear in the cosine. Its mean over a row is that of the table."""
     pool = Pool.of(tables)
     rows, offsets = np.arange(40), (np.arange(8) + 0.5) / 8
     linear = replace(pool, albedo=np.tile((0.1 + (rows + 0.5) / 50)[None, :, None], (6, 1, 3)))
@@ -103,7 +109,7 @@ def test_albedos_within_a_row_follow_its_neighbours(tables):
     np.testing.assert_allclose(found, any_albedo.albedo[rows % 6, rows], rtol=1e-12)
 
 
-def test_batches_come_in_order_and_stacked():
+def test_batches_come_in_order_and_in_groups():
     groups = list(batches(lambda step: Batch(*[np.full(2, step)] * len(Batch._fields)), 3, 10, 3))
     assert [first for first, _ in groups] == [3, 6, 9]
     assert [group.mu[:, 0].tolist() for _, group in groups] == [[3, 4, 5], [6, 7, 8], [9]]

@@ -1,4 +1,4 @@
-"""The training loop by itself: it minimises any objective over any tree of weights, and goes on from a checkpoint."""
+"""The training loop minimises any objective over any tree of weights, and resumes from a checkpoint."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ START = {"moved": np.array([3.0, -2.0]), "held": (np.array(5.0),)}
 
 
 def distance(weights, batch, recipe):
-    """Least where `moved` is 1; `held` counts without being changed."""
+    """Returns a loss and a log loss. Both are least where `moved` is 1. `held` adds to the loss but has no gradient."""
     total = ((weights["moved"] - 1.0) ** 2).sum() + jax.lax.stop_gradient(weights["held"][0]) ** 2
     return total, total - 25.0
 
@@ -41,7 +41,7 @@ def test_a_tree_of_weights_reaches_the_minimum_of_an_objective(tmp_path):
     assert run.log_losses[-1] == pytest.approx(0.0, abs=1e-4)
 
 
-def test_it_goes_on_from_a_checkpoint_as_if_never_stopped(tmp_path):
+def test_the_loop_resumes_from_a_checkpoint_as_if_never_stopped(tmp_path):
     whole, _ = train(tmp_path / "whole.ckpt")
     _, stopped = train(tmp_path / "parts.ckpt", budget=0.0)
     assert stopped.step == loop.GROUP

@@ -1,4 +1,4 @@
-"""Weights files: what is written comes back, what is wrong is said in one line."""
+"""Weights files: an adapter is the same after saving and loading, and a faulty file is refused in one line."""
 
 import json
 import re
@@ -21,20 +21,20 @@ from nma.params import LAYERED3, ParamSpace
 
 @pytest.fixture
 def path(tmp_path):
-    """A good weights file."""
+    """The path of a correct weights file."""
     file = tmp_path / "good.safetensors"
     random_adapter().save(file)
     return file
 
 
 def parts(path):
-    """(metadata, tensors) of a weights file."""
+    """Returns (metadata, tensors) of a weights file."""
     with safe_open(path, framework="numpy") as f:
         return f.metadata(), {name: f.get_tensor(name) for name in f.keys()}  # noqa: SIM118
 
 
 def refusal(path):
-    """The message with which a file is refused: one line, which names the file."""
+    """Returns the message by which `Adapter.load` refuses a file. It must be one line and name the file."""
     with pytest.raises(WeightsError) as caught:
         Adapter.load(path)
     message = str(caught.value)
@@ -45,7 +45,7 @@ def refusal(path):
 
 @pytest.mark.parametrize("name", ("raw", "layered3", "direction"))
 @pytest.mark.parametrize(("variant", "form"), VARIANTS.items())
-def test_an_adapter_comes_back_from_its_file(tmp_path, name, variant, form):
+def test_an_adapter_is_the_same_after_saving_and_loading(tmp_path, name, variant, form):
     before = replace(random_adapter(*form, name=name), bounded=form[1])
     assert before.variant == variant
     before.save(tmp_path / "new" / "a.safetensors")
@@ -61,7 +61,10 @@ def test_an_adapter_comes_back_from_its_file(tmp_path, name, variant, form):
 
 
 def test_stretched_targets_follow_the_direction(tmp_path):
-    """A plane of incidence needs one; files that say otherwise are refused."""
+    """A file with a stretched target that does not depend on the direction is refused.
+
+    Stretching lies in the plane of incidence, which the direction determines.
+    """
     path = tmp_path / "a.safetensors"
     random_adapter(params=target.STRETCHED_PARAMS).save(path)
     assert Adapter.load(path).in_plane
@@ -70,7 +73,7 @@ def test_stretched_targets_follow_the_direction(tmp_path):
 
 
 def test_the_file_describes_itself(path):
-    """Everything that another language needs stands in the JSON of the header."""
+    """The JSON header holds everything that a reader in another language needs."""
     metadata, tensors = parts(path)
     header = json.loads(metadata["nma"])
     assert header["class_name"] == "layered3"
@@ -142,7 +145,7 @@ def _parameters(header, number, **changes):
 
 
 def _target(header, **changes):
-    """With another declaration of `roughness`."""
+    """Returns the header with changes to the declaration of `roughness`."""
     rows = [dict(p) for p in header["target"]]
     rows[1] |= changes
     return {**header, "target": rows}
@@ -245,7 +248,7 @@ def test_tensors_that_do_not_fit_are_refused(path, change):
 @pytest.mark.parametrize("depth", (40, 2000, 100_000))
 @pytest.mark.parametrize("brackets", ("[]", "{}"))
 def test_metadata_nested_without_end_is_refused(path, depth, brackets):
-    """Whole or cut off, before anything recurses; brackets within strings nest nothing."""
+    """Deeply nested JSON, complete or cut off, is refused before a recursive parser reads it."""
     opening = brackets[0] if brackets == "[]" else '{"a":'
     _, tensors = parts(path)
     for text in (opening * depth, opening * depth + "0" + brackets[1] * depth):
@@ -253,14 +256,14 @@ def test_metadata_nested_without_end_is_refused(path, depth, brackets):
         assert f"nests {depth} deep" in refusal(path)
 
 
-def test_brackets_in_strings_nest_nothing(path, tmp_path):
+def test_brackets_in_strings_do_not_count_as_nesting(path, tmp_path):
     adapter = Adapter.load(path)
     replace(adapter, training={"data": '[{"\\' * 100}).save(tmp_path / "words.safetensors")
     assert Adapter.load(tmp_path / "words.safetensors").training["data"].count("[") == 100
 
 
 @pytest.mark.parametrize("kind", (np.int32, np.int64, np.uint8, np.float16, np.float64))
-def test_weights_of_other_numbers_are_refused(path, kind):
+def test_weights_of_another_number_type_are_refused(path, kind):
     metadata, tensors = parts(path)
     for name in ("layer0.weight", "layer2.bias"):
         path.write_bytes(save(tensors | {name: tensors[name].astype(kind)}, metadata=metadata))
