@@ -101,7 +101,7 @@ def test_a_material_that_is_not_there_is_refused(merl_file):
         read(merl_file, "crome")
     with pytest.raises(SourceError, match="no material 'zzz' among its 100; it has alum-bronze"):
         read(merl_file, "zzz")
-    with pytest.raises(SourceError, match=r"networks of 100 material\(s\); say which: alum-bronze, "):
+    with pytest.raises(SourceError, match=r"holds 100 material\(s\); say which: alum-bronze, "):
         read(merl_file)
 
 

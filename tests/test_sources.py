@@ -1,6 +1,8 @@
 """Rules for every source that can be evaluated: values near the horizon, and the error for a missing file."""
 
 import math
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -10,10 +12,13 @@ from source_cases import direction, numbers
 from nma import sources
 from nma.adapter.values import AdapterValues
 from nma.errors import SourceError
+from nma.sources import catalogue
 from nma.sources.coating import Coating
+from nma.sources.files import Format
 from nma.sources.merl import SHAPE, Merl
 from nma.sources.mitsuba_bsdf import from_dict
 from nma.sources.nbrdf import WEIGHTS, Nbrdf
+from nma.table import collection
 
 SOURCES = {
     "coating": lambda: Coating(absorption=(0.0, 0.1, 0.3)),
@@ -64,7 +69,7 @@ def test_measured_values_at_the_horizon_are_finite(measurements, name):
     assert_finite(source, 1.1 * peak)
 
 
-@pytest.mark.parametrize("ending", sources.endings())
+@pytest.mark.parametrize("ending", sources.FORMATS)
 @pytest.mark.parametrize("name", ["none", "x" * 300, "a\0b"])
 @pytest.mark.parametrize("material", [None, "gold"])
 def test_of_a_file_that_is_not_there_nothing_else_is_said(tmp_path, ending, name, material):
@@ -74,3 +79,40 @@ def test_of_a_file_that_is_not_there_nothing_else_is_said(tmp_path, ending, name
     if name == "none":
         assert message.startswith("no such file")
     assert "many" not in message and "\n" not in message
+
+
+@pytest.mark.parametrize("ending", sources.FORMATS)
+@pytest.mark.parametrize("content", [b"", b"PK", b"<bsdf", bytes(100)], ids=("empty", "zip", "xml", "zeros"))
+def test_a_damaged_file_of_any_format_is_refused_by_all_who_read_it(tmp_path, ending, content):
+    path = tmp_path / f"gold{ending}"
+    path.write_bytes(content)
+    form = sources.format_of(path)
+    readers = [lambda: sources.read(path, "gold"), form.identify and (lambda: form.identify(path))]
+    readers += [form.names and (lambda: form.names(path))]
+    for read in filter(None, readers):
+        with pytest.raises(SourceError, match=f"gold{ending}: "):
+            read()
+
+
+@pytest.mark.parametrize("ending", sources.FORMATS)
+def test_every_format_with_measurements_tells_which_a_file_is_of(ending):
+    form = sources.formats()[ending]
+    assert bool(form.measurements) == bool(form.identify)
+    assert all(measured in catalogue.MEASUREMENTS for measured in form.measurements)
+    for measured in form.measurements:
+        assert ending in measured.files and measured.name.startswith(form.name)
+        assert all(name.endswith(ending) for name in measured.known)
+
+
+def test_a_new_format_is_a_file_and_a_line(monkeypatch, tmp_path):
+    """Whatever reads, collects or lists files knows it then."""
+    module = types.ModuleType("nma.sources.grey")
+    module.FORMAT = Format("Grey", lambda path: Coating(alpha=float(path.read_text())))
+    monkeypatch.setitem(sys.modules, "nma.sources.grey", module)
+    monkeypatch.setitem(sources.FORMATS, ".grey", "grey:FORMAT")
+    (tmp_path / "dull.grey").write_text("0.5")
+    assert sources.read(tmp_path / "dull.grey").alpha == 0.5
+    (member,) = collection.members(tmp_path)
+    assert (member.name, member.read().alpha, collection.origin([member])) == ("dull", 0.5, "*.grey")
+    with pytest.raises(SourceError, match=r"files end in .*\.grey"):
+        sources.read("dull.gray")

@@ -23,19 +23,19 @@ def register(app: typer.Typer) -> None:
 
 @data.callback()
 def listing(context: typer.Context) -> None:
-    from nma.sources.catalogue import DATASETS
+    from nma.sources.catalogue import MEASUREMENTS
 
     if context.invoked_subcommand:
         return
-    for n, dataset in enumerate(DATASETS):
-        console.out.print(f"[bold]{dataset.name}[/bold]  {dataset.kind}", highlight=False, soft_wrap=True)
-        lines = {"from": dataset.origin, "paper": dataset.paper, "licence": dataset.licence}
-        lines["files"] = dataset.files
-        for name, (size, checksum) in dataset.known.items():
+    for n, measured in enumerate(MEASUREMENTS):
+        console.out.print(f"[bold]{measured.name}[/bold]  {measured.kind}", highlight=False, soft_wrap=True)
+        lines = {"from": measured.origin, "paper": measured.paper, "licence": measured.licence}
+        lines["files"] = measured.files
+        for name, (size, checksum) in measured.known.items():
             lines[name] = f"{size:,} bytes, SHA-256 {checksum}"
         for name, text in lines.items():
             console.tell(f"  {name}: {text}")
-        if n + 1 < len(DATASETS):
+        if n + 1 < len(MEASUREMENTS):
             console.out.print()
 
 
@@ -49,7 +49,7 @@ def check(path: Annotated[Path, typer.Argument(help="A file, or a folder with fi
 
     findings = list(catalogue.check(path))
     for f in findings:
-        line = f"{'ok' if f.ok else 'FAULT':5}  {f.dataset:10}  {f.path}: {f.note}"
+        line = f"{'ok' if f.ok else 'FAULT':5}  {f.measurements:10}  {f.path}: {f.note}"
         console.tell(line)
     if not all(f.ok for f in findings):
         raise typer.Exit(1)

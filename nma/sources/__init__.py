@@ -1,16 +1,18 @@
 """The sources: models and files that say how materials look.
 
 To simulate a new class of materials, add one file to this folder and one line to `_FACTORIES`. To read a new kind of
-file with the values of materials, add one file and one line to `_READERS`.
+file with the values of materials, add one file and one line to `FORMATS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 from nma.errors import ParamError, SourceError
 from nma.sources.base import Source, Values
+from nma.sources.files import Format
 
 
 def _layered3() -> Source:
@@ -34,47 +36,29 @@ def get(name: str) -> Source:
     return _FACTORIES[name]()
 
 
-def _merl(path: Path, material: str | None) -> Values:
-    from nma.sources.merl import Merl
-
-    return Merl.load(path)
-
-
-def _rgl(path: Path, material: str | None) -> Values:
-    from nma.sources.mitsuba_bsdf import measured
-
-    return measured(path)
-
-
-def _xml(path: Path, material: str | None) -> Values:
-    from nma.sources.mitsuba_bsdf import from_xml
-
-    return from_xml(path)
-
-
-def _nbrdf(path: Path, material: str | None) -> Values:
-    from nma.sources import nbrdf
-
-    if material is None:
-        names, _ = nbrdf.read(path)
-        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-        raise SourceError(f"{path}: holds the networks of {len(names)} material(s); say which: {listed}")
-    return nbrdf.Nbrdf.load(path, material)
-
-
-# The function that reads a file, by the file's extension. Its second argument names a material, for files that hold
-# several.
-_READERS: dict[str, Callable[[Path, str | None], Values]] = {
-    ".binary": _merl,
-    ".bsdf": _rgl,
-    ".xml": _xml,
-    ".npz": _nbrdf,
+# Where the format of a file is declared, by the file's extension: a module of this folder, and a name in it.
+FORMATS = {
+    ".binary": "merl:FORMAT",
+    ".bsdf": "mitsuba_bsdf:MEASURED",
+    ".xml": "mitsuba_bsdf:XML",
+    ".npz": "nbrdf:FORMAT",
 }
 
 
-def endings() -> tuple[str, ...]:
-    """The extensions of the files that `read` understands."""
-    return tuple(_READERS)
+def formats() -> dict[str, Format]:
+    """The formats of files that `read` understands, by the extension of the files."""
+    homes = {ending: home.split(":") for ending, home in FORMATS.items()}
+    return {
+        ending: getattr(import_module(f"nma.sources.{module}"), name)
+        for ending, (module, name) in homes.items()
+    }
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file, by its extension. Raises `SourceError` if no source reads such files."""
+    if path.suffix not in FORMATS:
+        raise SourceError(f"{path}: no source reads such files; readable files end in {', '.join(FORMATS)}")
+    return formats()[path.suffix]
 
 
 def read(path: str | Path, material: str | None = None) -> Values:
@@ -84,6 +68,11 @@ def read(path: str | Path, material: str | None = None) -> Values:
     `material` names the network. Raises `SourceError` for any other file, and for a missing or damaged file.
     """
     path = Path(path)
-    if path.suffix not in _READERS:
-        raise SourceError(f"{path}: no source reads such files; readable files end in {', '.join(_READERS)}")
-    return _READERS[path.suffix](path, material)
+    found = format_of(path)
+    if found.names is None:
+        return found.read(path)
+    if material is None:
+        names = found.names(path)
+        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        raise SourceError(f"{path}: holds {len(names)} material(s); say which: {listed}")
+    return found.read(path, material)

@@ -24,6 +24,7 @@ from nma.jit import dr
 from nma.ops import Color, Vec3
 from nma.sources import files
 from nma.sources.base import Values
+from nma.sources.files import Format, Measurements
 from nma.sources.half_difference import angles, directions
 from nma.sources.lookup import Lookup
 
@@ -134,3 +135,20 @@ def _check_size(path: Path, content: bytes) -> None:
     if len(content) != BYTES:
         what = "truncated" if len(content) < BYTES else "too long"
         raise SourceError(f"{path}: {what}, {len(content):,} bytes instead of {BYTES:,}; copy it again")
+
+
+def _identify(path: Path) -> str:
+    read(path)
+    return "MERL"
+
+
+MERL = Measurements(
+    "MERL",
+    "measurement: 100 isotropic materials",
+    "https://www.merl.com/research/downloads/BRDF",
+    "Matusik et al. 2003, A Data-Driven Reflectance Model",
+    "CC-BY-SA-4.0",
+    f"100 files NAME.binary of {BYTES:,} bytes each",
+    {},
+)
+FORMAT = Format("MERL", Merl.load, measurements=(MERL,), identify=_identify)

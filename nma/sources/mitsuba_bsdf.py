@@ -20,6 +20,7 @@ from nma.jit import dr
 from nma.ops import Color, Vec3
 from nma.sources import rgl
 from nma.sources.base import direction
+from nma.sources.files import Format
 
 # A BSDF is tested for isotropy at this many pairs of directions. Rounding explains relative changes up to `_ROUNDING`.
 _PAIRS = 512
@@ -187,3 +188,12 @@ def _interaction(mi: Any, wi: Any, uv: tuple[float, float]) -> Any:
     si.sh_frame = mi.Frame3f(mi.Normal3f(0.0, 0.0, 1.0))
     si.dp_du, si.dp_dv = mi.Vector3f(1.0, 0.0, 0.0), mi.Vector3f(0.0, 1.0, 0.0)
     return si
+
+
+def _identify(path: Path) -> str:
+    rgl.read(path)
+    return "RGL"
+
+
+MEASURED = Format("RGL", measured, measurements=(rgl.RGL,), identify=_identify)
+XML = Format("Mitsuba", from_xml)

@@ -21,12 +21,13 @@ from nma.errors import SourceError
 from nma.files import arrays
 from nma.jit import dr
 from nma.ops import Color, Vec3
+from nma.sources.files import Format, Measurements
 from nma.sources.half_difference import half_difference
 
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# One material of each data set: a weights file that has it was fitted to that data set.
+# By one material of each: a weights file that has it was fitted to these measurements.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
@@ -90,3 +91,51 @@ def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
     if weights.dtype.kind != "f" or not np.isfinite(weights).all():
         raise SourceError(f"{path}: some weights are not finite numbers; copy it again")
     return names.tolist(), weights.astype(np.float32)
+
+
+def _names(path: Path) -> list[str]:
+    return read(path)[0]
+
+
+def _identify(path: Path) -> str:
+    return kind(_names(path))
+
+
+def _claims(path: Path) -> bool:
+    """Other `.npz` files, such as tables, have no weights."""
+    try:
+        with arrays(path) as f:
+            return "weights" in f
+    except Exception:  # zipfile raises its own exceptions for damaged archives
+        return False
+
+
+MERL = Measurements(
+    "NBRDF-MERL",
+    "neural reconstruction: a network for each of MERL's 100 materials",
+    "https://github.com/asztr/Neural-BRDF (data/merl_nbrdf.zip), gathered in one file",
+    "Sztrajman et al. 2021, Neural BRDF Representation and Importance Sampling",
+    "MIT",
+    "merl_nbrdf_weights.npz with names (100,) and weights (100, 675)",
+    {
+        "merl_nbrdf_weights.npz": (
+            256_573,
+            "b6441e3c3168f62fd0d331da3cf66a692602dda4159119c2775ed8e904a00f6a",
+        )
+    },
+)
+RGL = Measurements(
+    "NBRDF-RGL",
+    "neural reconstruction: a network for each of 51 isotropic RGL materials",
+    "https://github.com/asztr/Neural-BRDF (data/rgl-isotropic_nbrdf.zip), gathered in one file",
+    "Sztrajman et al. 2021, Neural BRDF Representation and Importance Sampling",
+    "MIT",
+    "rgl-isotropic_nbrdf_weights.npz with names (51,) and weights (51, 675)",
+    {
+        "rgl-isotropic_nbrdf_weights.npz": (
+            131_114,
+            "7cf51ffc6893b180bb28253d548df847eda0b968d7a90568928bfb71c324cae4",
+        )
+    },
+)
+FORMAT = Format("NBRDF", Nbrdf.load, _names, (MERL, RGL), _identify, _claims)

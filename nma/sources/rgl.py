@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from nma.errors import SourceError
 from nma.sources import files
+from nma.sources.files import Measurements
 
 _MAGIC = b"tensor_file\0"
 # NumPy types by their number in the file. Files of materials use no other numbers.
@@ -128,3 +129,31 @@ def _check_grid(path: Path, name: str, angles: NDArray, low: float, high: float)
         raise SourceError(
             f"{path}: field '{name}' does not ascend within {low:.4g} .. {high:.4g}; copy the file again"
         )
+
+
+RGL = Measurements(
+    "RGL",
+    "measurement: isotropic and anisotropic materials",
+    "https://rgl.epfl.ch/materials",
+    "Dupuy and Jakob 2018, An Adaptive Parameterization for Efficient Material Acquisition and Rendering",
+    "not stated in the files; read the terms on that page before you pass a file on",
+    "one file NAME_rgb.bsdf per material; the file of an isotropic material has about 0.5 to 1 MB",
+    {
+        "cc_ibiza_sunset_rgb.bsdf": (
+            658_952,
+            "ce356ec33ac086aa19eb534dbfc21e08c793790c299e2cab660705d40c665f0a",
+        ),
+        "cg_sunflower_rgb.bsdf": (
+            1_055_240,
+            "ce817d04568c39284908ce89b12989e68d6407ee48fb44f6cc644e7bfdf7c840",
+        ),
+        "colodur_napoli_4f_rgb.bsdf": (
+            658_960,
+            "8a8d491956c36ab75c1676ee2acc34c550215a3e771ef5b7e3046654359000c1",
+        ),
+        "paper_white_rgb.bsdf": (
+            658_928,
+            "9d641fbb56358275509b2b1053d1002313e2dabc7b3ec202eb5c5a6943f7b70e",
+        ),
+    },
+)

@@ -13,7 +13,6 @@ import numpy as np
 
 from nma import sources
 from nma.errors import SourceError
-from nma.sources import nbrdf
 from nma.sources.base import Values
 from nma.table.grid import Tables, kept
 from nma.table.values import tabulate_values
@@ -45,11 +44,12 @@ def members(path: str | Path) -> list[Member]:
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path}: no such folder or file; `nma data` says where to get measured materials")
-    endings = sources.endings()
     files = sorted(f for f in path.iterdir() if f.is_file()) if path.is_dir() else [path]
-    found = [member for file in files if file.suffix in endings for member in _of_file(file)]
+    found = [member for file in files if file.suffix in sources.FORMATS for member in _of_file(file)]
     if not found:
-        raise SourceError(f"{path}: holds no material; files of materials end in {', '.join(endings)}")
+        raise SourceError(
+            f"{path}: holds no material; files of materials end in {', '.join(sources.FORMATS)}"
+        )
     name, count = Counter(member.name for member in found).most_common(1)[0]
     if count > 1:
         raise SourceError(f"{path}: {count} materials are called '{name}'; rename or remove one of the files")
@@ -57,16 +57,18 @@ def members(path: str | Path) -> list[Member]:
 
 
 def _of_file(file: Path) -> list[Member]:
-    if file.suffix != ".npz":
-        return [Member(file.stem, file)]
-    return [Member(name, file, name) for name in nbrdf.read(file)[0]]
+    names = sources.format_of(file).names
+    return [Member(file.stem, file)] if names is None else [Member(name, file, name) for name in names(file)]
 
 
 def origin(chosen: Sequence[Member]) -> str:
     """The origin of the materials, for messages and records: a name such as NBRDF-MERL, or their files' extensions."""
-    if all(member.material for member in chosen):
-        return nbrdf.kind([member.name for member in chosen])
-    return ", ".join(sorted({f"*{member.path.suffix}" for member in chosen}))
+    return ", ".join(sorted({_origin(path) for path in {member.path for member in chosen}}))
+
+
+def _origin(file: Path) -> str:
+    found = sources.format_of(file)
+    return found.identify(file) if found.names and found.identify else f"*{file.suffix}"
 
 
 def tables(

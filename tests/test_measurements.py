@@ -1,4 +1,4 @@
-"""`nma data`: its list of data sets, and its check of a user's copies."""
+"""`nma data`: its list, and its check of a user's copies."""
 
 import shutil
 from functools import partial
@@ -8,7 +8,7 @@ import pytest
 
 from nma.errors import SourceError
 from nma.sources import catalogue, merl
-from nma.sources.catalogue import DATASETS
+from nma.sources.catalogue import MEASUREMENTS
 from nma.sources.merl import Merl
 
 
@@ -26,34 +26,36 @@ def uniform(tmp_path):
     return path
 
 
-def test_every_data_set_is_listed_with_its_origin_terms_and_files(data):
+def test_all_measurements_are_listed_with_their_origin_terms_and_files(data):
     code, out, err = data()
     assert (code, err) == (0, "")
-    assert [d.name for d in DATASETS] == ["MERL", "RGL", "NBRDF-MERL", "NBRDF-RGL"]
-    for dataset in DATASETS:
+    assert [d.name for d in MEASUREMENTS] == ["MERL", "RGL", "NBRDF-MERL", "NBRDF-RGL"]
+    for measured in MEASUREMENTS:
         for text in (
-            dataset.name,
-            dataset.kind,
-            dataset.origin,
-            dataset.paper,
-            dataset.licence,
-            dataset.files,
+            measured.name,
+            measured.kind,
+            measured.origin,
+            measured.paper,
+            measured.licence,
+            measured.files,
         ):
             assert text in out
-        for name, (size, checksum) in dataset.known.items():
+        for name, (size, checksum) in measured.known.items():
             assert f"{name}: {size:,} bytes, SHA-256 {checksum}" in out
 
 
 def test_a_reconstruction_is_never_called_a_measurement():
-    for dataset in DATASETS:
-        assert dataset.kind.startswith("neural reconstruction" if "NBRDF" in dataset.name else "measurement")
+    for measured in MEASUREMENTS:
+        assert measured.kind.startswith(
+            "neural reconstruction" if "NBRDF" in measured.name else "measurement"
+        )
 
 
 def test_sound_copies_are_as_known(data, measurements):
     code, out, _ = data("check", measurements)
     assert code == 0
     lines = out.splitlines()
-    known = [name for dataset in DATASETS for name in dataset.known]
+    known = [name for measured in MEASUREMENTS for name in measured.known]
     assert len(lines) >= len(known) == 6
     for name in known:
         (line,) = (line for line in lines if name in line)
@@ -98,12 +100,15 @@ def test_faults_are_named_file_by_file(data, uniform, measurements):
     }
 
 
-def test_what_is_no_data_set_is_said_to_be_none(data, tmp_path):
+def test_what_is_no_measurement_is_said_to_be_none(data, tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     code, out, _ = data("check", tmp_path / "notes.txt")
     assert (code, out.split()[0]) == (1, "FAULT")
-    assert "no file of a known data set (.binary, .bsdf, .npz)" in out
-    for path, message in ((tmp_path, "holds no file of a known data set"), (tmp_path / "no", "no such file")):
+    assert "no file of known measurements (.binary, .bsdf, .npz)" in out
+    for path, message in (
+        (tmp_path, "holds no file of known measurements"),
+        (tmp_path / "no", "no such file"),
+    ):
         with pytest.raises(SourceError, match=message):
             list(catalogue.check(path))
         code, out, err = data("check", path)
