@@ -130,11 +130,20 @@ def test_sanitizers_find_nothing(sanitizer, tmp_path):
     assert ", 0 faults" in output(program, 100_000, WEIGHTS[0])
 
 
+def test_sanitizers_find_nothing_in_the_simulated_material(tmp_path):
+    """Walks, estimates, densities and samples of all that the class allows, and of the hard cases."""
+    flags = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    program = built("g++", "tests/soak_layered.cpp", tmp_path, *flags)
+    assert ", 0 faults" in output(program, 20_000)
+
+
 @pytest.mark.slow
 def test_a_million_calls_are_sound(weights, tmp_path):
     program = built("g++", "tests/soak.cpp", tmp_path, "-O2")
     for path in weights:
         assert ", 0 faults" in output(program, 1_000_000, path)
+    simulated = built("g++", "tests/soak_layered.cpp", tmp_path, "-O2")
+    assert ", 0 faults" in output(simulated, 1_000_000)
 
 
 @pytest.mark.slow

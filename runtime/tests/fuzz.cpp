@@ -1,7 +1,7 @@
 // Bytes that call themselves a weights file: whatever they are, loading ends in an adapter that works or in an error.
 //
-// Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER -Iruntime \
-//                           runtime/tests/fuzz.cpp -o fuzz
+// Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER
+//                           -Iruntime runtime/tests/fuzz.cpp -o fuzz
 //                       ./fuzz -max_total_time=600 -max_len=4000 CORPUS
 // By chance alone:      c++ -std=c++17 -O1 -g -fsanitize=address,undefined -Iruntime runtime/tests/fuzz.cpp -o fuzz
 //                       ./fuzz COUNT WEIGHTS ...    changes bytes, words and lengths of these files, COUNT times each
@@ -12,16 +12,14 @@
 #include <cstdlib>
 #include <random>
 
+#include "random.h"
+
 namespace {
+
+using nma::tests::sound;
 
 void require(bool sound) {
     if (!sound) std::abort();
-}
-
-bool sound(const nma::Vec3<float>& v, float pdf) {
-    for (const float x : {v.x, v.y, v.z, pdf})
-        if (!nma::is_finite(x) || x < 0.0f) return false;
-    return true;
 }
 
 // An adapter from these bytes is asked for a material, and refusal must be an `Error`. Returns whether it loaded.

@@ -7,57 +7,25 @@
 #include <atomic>
 #include <cstdio>
 #include <cstdlib>
-#include <random>
 #include <thread>
+
+#include "random.h"
 
 namespace {
 
+using nma::tests::draw_direction;
+using nma::tests::Random;
+using nma::tests::sound;
+
 constexpr int CALLS_PER_ROUND = 18;
 constexpr float TOLERANCE = 1e-4f;
-
-// Uniform numbers in [0, 1), now and then an end of the range.
-class Random {
-public:
-    explicit Random(unsigned seed) : engine_(seed) {}
-    float operator()() {
-        const std::uint32_t bits = engine_();
-        if ((bits & 0xff) == 0) return bits & 0x100 ? 0.0f : 0.99999994f;
-        return static_cast<float>(bits >> 8) * 0x1p-24f;
-    }
-
-private:
-    std::mt19937 engine_;
-};
-
-// Training ranges: widths by powers, the conductor and the medium uniformly.
-void draw_parameters(const nma::Adapter& adapter, Random& random, float* to) {
-    for (const nma::SourceParam& p : adapter.parameters())
-        for (int c = 0; c < p.size; ++c) {
-            const float low = static_cast<float>(p.low), high = static_cast<float>(p.high), u = random();
-            *to++ = p.logarithmic ? low * std::pow(high / low, u) : low + (high - low) * u;
-        }
-}
-
-// Over the hemisphere, now and then at the pole or near the horizon.
-nma::Direction draw_direction(Random& random) {
-    const float choice = random(), u = random(), phi = 6.2831853f * random();
-    const float z = choice < 0.02f ? 1.0f : choice < 0.1f ? 1e-4f * u + 1e-6f : u;
-    const float r = nma::safe_sqrt(1.0f - z * z);
-    return {r * std::cos(phi), r * std::sin(phi), z};
-}
-
-bool sound(const nma::Vec3<float>& v, float pdf) {
-    for (const float x : {v.x, v.y, v.z, pdf})
-        if (!nma::is_finite(x) || x < 0.0f) return false;
-    return true;
-}
 
 bool close(float a, float b) { return std::abs(a - b) <= TOLERANCE * std::max(std::abs(a), std::abs(b)); }
 
 // A material, and `CALLS_PER_ROUND` calls. Returns what is wrong, or null.
 const char* round_of_calls(const nma::Adapter& adapter, Random& random) {
     float parameters[64];
-    draw_parameters(adapter, random, parameters);
+    nma::tests::draw_parameters(adapter.parameters(), random, parameters);
     const nma::Direction wi = draw_direction(random);
     const nma::Brdf brdf = adapter.prepare(parameters, wi);
     for (int k = 0; k < CALLS_PER_ROUND / 6; ++k) {
