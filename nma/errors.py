@@ -49,7 +49,7 @@ class MissingDependencyError(NmaError, ImportError):
 
 
 def either(words: Iterable[str]) -> str:
-    """What may be chosen: a, b or c."""
+    """Joins options to a text such as "a, b or c"."""
     *others, last = words
     return f"{', '.join(others)} or {last}" if others else last
 

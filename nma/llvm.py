@@ -152,9 +152,9 @@ def find() -> tuple[str, int]:
 
 
 def ensure_llvm() -> None:
-    """Makes sure that Dr.Jit uses a libLLVM it works with. Call it before the first CPU kernel.
+    """Makes sure that Dr.Jit uses a libLLVM that is new enough. Call this function before the first CPU kernel.
 
-    Dr.Jit loads libLLVM when it is first imported. Before that import, this function sets DRJIT_LIBLLVM_PATH, unless
+    The first import of Dr.Jit loads libLLVM. Before that import, this function sets DRJIT_LIBLLVM_PATH, unless
     the user has set it. After the import, it asks Dr.Jit which libLLVM is loaded. Raises `MissingDependencyError` if
     there is no usable libLLVM, or if Dr.Jit has loaded one that is too old.
     """

@@ -36,7 +36,7 @@ _PYTHON = _Python()
 
 
 def library(*args: Any) -> str:
-    """Name of the array library that owns the arguments: "drjit", "jax", "numpy" or "python" for plain numbers."""
+    """The array package that the arguments belong to: "drjit", "jax", "numpy", or "python" for plain numbers."""
     for a in args:
         module = type(a).__module__
         if module.startswith(("drjit", "mitsuba")):
@@ -48,7 +48,7 @@ def library(*args: Any) -> str:
 
 
 def _module(*args: Any) -> Any:
-    """The array library itself, imported only when an argument of its own shows that it is in use."""
+    """The module with the operations for the arguments. Dr.Jit and JAX are imported only if an argument needs them."""
     owner = library(*args)
     if owner == "drjit":
         import drjit
@@ -211,7 +211,7 @@ Color = Vec3
 
 
 def at_azimuth_0(cos_theta: Float) -> Vec3:
-    """The unit direction with this cosine to the normal that lies above the x axis."""
+    """The unit direction at azimuth 0 (y = 0, x >= 0) whose cosine to the normal is given."""
     return Vec3(safe_sqrt(1.0 - cos_theta * cos_theta), 0.0 * cos_theta, cos_theta)
 
 

@@ -27,7 +27,7 @@ class Conductors:
         return len(self.names)
 
     def distinct(self) -> np.ndarray:
-        """Row numbers, ascending, such that every different (eta, k) occurs once: some rows have equal numbers."""
+        """The numbers of the rows without duplicates, ascending: some substances are in the table twice."""
         _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
         return np.sort(first)
 

@@ -1,7 +1,8 @@
-"""The functions, structures and constants of the target, as syntax trees. A function comes after those it calls.
+"""The functions, structures and constants of the target, as syntax trees.
 
-They are written in the part of Python that every shading language has, too: assignments of expressions to names,
-arithmetic, comparisons, calls, fields, and one return at the end. Anything else raises an error with its file and line.
+A function comes after all functions that it calls. The functions use only what every shading language has: assignments
+of expressions to names, arithmetic, comparisons, calls, fields, and one return at the end. Anything else raises an
+error with its file and line.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ STRUCTURES: tuple[type, ...] = (
     albedo.Albedos,
     plane.Plane,
 )
-# A function comes after those it calls. The method `of` of the structure `Plane` becomes the function `plane_of`.
+# A function comes after all functions that it calls. The method `of` of the structure `Plane` becomes the function
+# `plane_of`.
 FUNCTIONS: tuple[Callable, ...] = (
     microfacet.ggx_d,
     microfacet.smith_g1,

@@ -34,7 +34,7 @@ class Finding:
 
 
 def check(path: str | Path) -> Iterator[Finding]:
-    """Checks a file, or every file in a folder and its subfolders that belongs to measurements.
+    """Checks one file, or all files of measurements in a folder and its subfolders. Yields a `Finding` for each.
 
     The check compares the file's size and checksum with the known ones. It also reads the file, to see whether its
     structure and its values make sense. Raises `SourceError` if there is no file to check.

@@ -2,8 +2,8 @@
 
 The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". It adds two microfacet
 reflections: that of the coat, and that of the metal. The metal's reflection is evaluated for the directions refracted
-at the mean surface. The Fresnel transmittance and the absorption on the way in and on the way out dim it. Light that
-bounces between the two interfaces is left out, so the model is darker than a simulation of the stack.
+at the mean surface. It is multiplied by the Fresnel transmittance and the absorption of the way in and of the way out.
+Light that bounces between the two interfaces is left out, so the model is darker than a simulation of the stack.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Coating:
             inside_i, inside_o, self.alpha_metal
         )
         path = 1.0 / inside_i.z + 1.0 / inside_o.z
-        # Refraction into the coat changes the beam by eta^2 cos(inside) / cos(outside). Divided by this, the metal's
-        # reflection becomes f of the whole stack times the outer cosine.
+        # On the way out, refraction multiplies the solid angle of the beam by eta^2 cos(inside) / cos(outside). So the
+        # metal's reflection is divided by this factor.
         through = (1.0 - loss_i) * (1.0 - loss_o) * o.z / (self.eta * self.eta * inside_o.z)
         dimmed = Color(
             *(c * through * ops.exp(-a * path) for c, a in zip(metal, self.absorption, strict=True))

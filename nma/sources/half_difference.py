@@ -1,4 +1,4 @@
-"""Rusinkiewicz coordinates: the half vector and the difference vector, which is the light in the half vector's frame.
+"""Rusinkiewicz coordinates: the half vector, and the light direction in its frame, called the difference vector.
 
 Rusinkiewicz 1998, "A New Change of Variables for Efficient BRDF Representation". The difference vector is built from
 the *light* direction. Built from the view direction, it would have the opposite azimuth, phi_d + pi. All functions here

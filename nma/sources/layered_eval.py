@@ -8,8 +8,8 @@ pair (wi, wo). The light from wi to wo splits into three kinds:
 - Light that enters the coat and scatters in the medium at least once.
 
 The last two kinds are sampled so that two narrow lobes never have to meet by chance (compare Guo, Hasan and Zhao 2018,
-section 5). All densities are those of particles, as in the walk. They lack the factor of the squared index by which
-radiance grows when it enters the coat.
+section 5). All densities are those of particles, as in the walk. Unlike radiance, they do not change by the squared
+index of refraction when a walk enters the coat.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def evaluate(layers: Layers, wi: Vec3, wo: Vec3, rng: Random, active: Mask = Tru
     forward, _ = _unscattered(layers, wi, there, wo, back, rng, True)
     backward, detour = _unscattered(layers, wo, back, wi, there, rng, False)
     scattered = _scattered(layers, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
-    # Walks from wo estimate f cos(theta_i), so reciprocity turns their result into f cos(theta_o). The way out is given
-    # below the coat, where radiance is larger by the squared index.
+    # Walks from wo estimate f cos(theta_i), which reciprocity turns into f cos(theta_o). Scattered light connects below
+    # the coat, where radiance is larger by the squared index, so it is divided by that.
     index2 = layers.eta_top * layers.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(layers, wi, wo)
@@ -74,7 +74,7 @@ def coat_reflection(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
 def _enter(layers: Layers, w: Vec3, rng: Random) -> Walk:
     """A walk that has come from `w` and is now just below the coat.
 
-    It always refracts, since the light that the coat reflects has a closed form.
+    The walk always refracts, because the light that the coat reflects has a closed form.
     """
     alpha = layers.alpha_top
     view = _above(w)
@@ -127,11 +127,12 @@ def _unscattered(
     """Light from wi to wo that meets interfaces only, and one segment of the walk `there` after its first segment.
 
     A path enters through the coat, visits the conductor once or more, and leaves through the coat. It is sampled from
-    both ends. All events are drawn except one, the connection, where the two ends meet by chance. The best connection
-    is the event with the widest lobe. The walk from wi connects at the way out (the walk goes on, and its density of
-    leaving along wo is evaluated) or at the last visit (the way out is drawn from wo, as `back`). The walk from wo
-    connects at the way in or at the first visit. A path with one visit thus has three possible connections. The balance
-    heuristic (Veach 1997, eq. 9.8) combines the connections by the sharpness of their events.
+    both ends. All events are drawn except one, the connection: there the two ends meet, and the density of the event is
+    evaluated. The best connection is the event with the widest lobe. The walk from wi connects at the way out (the walk
+    goes on, and its density of leaving along wo is evaluated) or at the last visit (the way out is drawn from wo, as
+    `back`). The walk from wo connects at the way in or at the first visit. A path with one visit thus has three
+    possible connections. The balance heuristic (Veach 1997, eq. 9.8) combines the connections by the sharpness of their
+    events.
     """
     source, clear = Layered3(), replace(layers, sigma_t=layers.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
@@ -258,9 +259,9 @@ def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     """Weights of the three lobes of `pdf`, which sum to 1, and the width of the second lobe.
 
     The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The
-    variances of tilted facets add up to the width of the second. A facet of the conductor shifts the tangential part of
-    a direction by 2 cos_t times the facet's slope. A facet of the coat shifts it by (eta cos_t - cos_i) / eta times the
-    facet's slope, and light crosses the coat twice.
+    squared width of the second lobe is the sum of the variances that tilted facets cause. A facet of the conductor
+    shifts the tangential part of a direction by 2 cos_t times the facet's slope. A facet of the coat shifts it by (eta
+    cos_t - cos_i) / eta times the facet's slope, and light crosses the coat twice.
     """
     eta, cos_i = layers.eta_top, ops.maximum(wi.z, 1e-3)
     fresnel, cos_t = fresnel_dielectric(cos_i, eta)

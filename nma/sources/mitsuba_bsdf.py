@@ -33,10 +33,10 @@ _MIN_COS = 1e-6
 class MitsubaBsdf:
     """A Mitsuba BSDF (`Values`), tied to the Mitsuba variant in which it was made.
 
-    If no variant is set yet, it sets `cuda_ad_rgb` on a machine with a GPU, else `llvm_ad_rgb`. `bsdf` is an instance
-    of `mi.BSDF`. `uv` is the point where its textures are looked up. `isotropic` says whether the BSDF is isotropic; if
-    it is None, a test with turned pairs of directions decides. Raises `SourceError` for a BSDF with a perfectly
-    specular reflection, and `ParamError` if the variant is not vectorised or not RGB.
+    If no variant is set yet, the constructor sets `cuda_ad_rgb` on a machine with a GPU, else `llvm_ad_rgb`. `bsdf` is
+    an instance of `mi.BSDF`. `uv` is the point where its textures are looked up. `isotropic` says whether the BSDF is
+    isotropic; if it is None, a test with turned pairs of directions decides. Raises `SourceError` for a BSDF with a
+    perfectly specular reflection, and `ParamError` if the variant is not vectorised or not RGB.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ def choose_variant() -> Any:
 
 
 def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> MitsubaBsdf:
-    """The BSDF that `load(mi)` returns, as a source. Raises `SourceError` if it fails or returns another object."""
+    """The BSDF that `load(mi)` returns, as a source. Raises `SourceError` if the call fails or returns no BSDF."""
     mi = choose_variant()
     try:
         bsdf = load(mi)

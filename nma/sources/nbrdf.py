@@ -58,7 +58,7 @@ class Nbrdf:
 
     @staticmethod
     def load(path: str | Path, material: str) -> Nbrdf:
-        """The network of one material. Raises `SourceError` for a damaged file, and if it has no such material."""
+        """The network of one material. Raises `SourceError` if the file is damaged or has no such material."""
         names, weights = read(path)
         if material not in names:
             near = difflib.get_close_matches(material, names, 1)

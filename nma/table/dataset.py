@@ -37,7 +37,7 @@ _BLOCK_WALKS = 1 << 27
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings that determine every number of a dataset. `walks` counts per material.
+    """The settings that determine every number of a dataset. `walks` is the number of random walks per material.
 
     `nma dataset --help` explains the other settings. Raises `DatasetError` if a setting is out of range.
     """
@@ -69,7 +69,7 @@ def draw_params(settings: Settings, indices: NDArray[np.integer] | Sequence[int]
 
 
 def _fingerprint(settings: Settings) -> str:
-    """A digest of drawn parameters. It differs if a version of the package draws other parameters from the seed."""
+    """A digest of drawn parameters. Versions of the package that draw other parameters have another digest."""
     ends = draw_params(settings, [0, settings.materials - 1]).astype(np.float32)
     return hashlib.sha256(ends.tobytes()).hexdigest()[:16]
 
@@ -114,7 +114,7 @@ class Dataset:
 
     @staticmethod
     def open(path: str | Path) -> Dataset:
-        """Opens the dataset at `path`. Raises `DatasetError` if there is none, or if it needs to be made again."""
+        """Opens the dataset at `path`. Raises `DatasetError` if there is none, or if another version made it."""
         path = Path(path)
         try:
             # Chunks of zeros are stored, too, because a chunk's file marks its material as done.

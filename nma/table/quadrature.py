@@ -23,7 +23,8 @@ from nma.table.grid import ISOTROPIC, Grid
 # narrowest lobe: with coarser points, training makes such lobes too broad.
 FINEST = 0.0005
 
-# By dimension d: the root of x^(d+1) = x + 1. A Kronecker lattice steps by powers of the root's inverse (Roberts 2018).
+# For each dimension d, the root of x^(d+1) = x + 1. The steps of a Kronecker lattice are powers of its inverse (Roberts
+# 2018).
 _ROOTS = {3: 1.2207440846057596, 4: 1.1673039782614187}
 
 
@@ -84,7 +85,7 @@ def bin_points(
     """Maps the point `u` of the unit cube to the bin (theta_i, theta_o, phi) = (i, o, p), given as floats."""
     near_mu, near_phi = _scales(i, grid, finest)
     mu_i, mu_o, weight = _cosines(i, o, u[0], u[1], grid, near_mu)
-    # psi is the azimuth between wo and the mirror direction. Its points, too, are denser around 0.
+    # psi is the azimuth between wo and the mirror direction. Points are denser around psi = 0.
     step = math.pi / grid.phi_o
     low = (grid.phi_o - 1.0 - p) * step
     psi, psi_density = _crowd(u[2], low, low + step, near_phi)
@@ -116,7 +117,7 @@ def anisotropic_bin_points(
 
 
 def _scales(i: Float, grid: Grid, finest: float) -> tuple[Float, Float]:
-    """How far a lobe of width `finest` reaches from the mirror direction: (in cos(theta), in azimuth)."""
+    """How far a lobe of width `finest` reaches from the mirror direction, as (cosine, azimuth [rad])."""
     mu = (i + 0.5) * (1.0 / grid.theta_i)
     sin = ops.sqrt(1.0 - mu * mu)
     return (2.0 * finest) * sin + 1e-5, ops.minimum((2.0 * finest) * mu / sin, 1.0)
@@ -142,8 +143,8 @@ def _pair(
     (low_x, width_x), (low_y, width_y) = x, y
     reach = 0.5 * (width_x + width_y)
     s, density = _crowd(u, centre - reach, centre + reach, scale)
-    # The length of the interval in `x` whose numbers can have the difference s to a number in `y`. As a function of s
-    # it is a triangle, or a trapezoid if the widths differ.
+    # The numbers of `x` that can have the difference s to a number in `y` form an interval of this length. As a
+    # function of s, the length is a triangle, or a trapezoid if the widths differ.
     room = ops.minimum(reach - ops.absolute(s - centre), min(width_x, width_y))
     room = ops.maximum(room, 1e-7 * width_x)
     # Draw the number in `x` uniformly from that interval.
@@ -152,7 +153,7 @@ def _pair(
 
 
 def _directions(mu_i: Float, mu_o: Float, psi: Float) -> tuple[Vec3, Vec3]:
-    """wi at azimuth 0 and wo at azimuth pi - psi. Written with psi, half vectors near the normal keep their digits."""
+    """wi at azimuth 0 and wo at azimuth pi - psi. These formulas give precise half vectors near the normal."""
     sin_i = ops.safe_sqrt((1.0 - mu_i) * (1.0 + mu_i))
     sin_o = ops.safe_sqrt((1.0 - mu_o) * (1.0 + mu_o))
     return Vec3(sin_i, 0.0 * mu_i, mu_i), Vec3(-sin_o * ops.cos(psi), sin_o * ops.sin(psi), mu_o)

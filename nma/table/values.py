@@ -78,7 +78,7 @@ def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POI
 
 
 def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
-    """Which bins are close to the mirror direction of a wi in the bin."""
+    """Marks the bins whose wo may be close to the mirror direction of their wi."""
     i, a, o, b = _indices(bins, grid)
     near_o = _apart(i, grid.theta_i, o, grid.theta_o) < _REACH
     # If both directions are close to the normal, so is the half vector, whatever the azimuths are.
