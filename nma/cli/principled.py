@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nma import files
 from nma.cli import console, options, reading
 
+if TYPE_CHECKING:
+    from nma.target import Principled
+
 # A mean error of the directional albedo above this shows in pictures, so a warning is printed.
 ALBEDO_LIMIT = 0.05
+
+
+def _xml(fitted: Principled) -> str:
+    from nma.export.mitsuba import principled_xml
+
+    return principled_xml(fitted)
+
+
+def _json(fitted: Principled) -> str:
+    from nma.export.mitsuba import principled_json
+
+    return principled_json(fitted)
+
+
+# The text of a file for a renderer, by the ending of its name. These functions import late: `nma --help` must be quick.
+_TEXTS: dict[str, Callable[[Principled], str]] = {".xml": _xml, ".json": _json}
 
 
 def register(app: typer.Typer) -> None:
@@ -38,8 +57,7 @@ def principled(
         Path | None,
         options.output(
             "A file to write too: a scene element for Mitsuba (.xml), .json, or weights (.safetensors).",
-            ".xml",
-            ".json",
+            *_TEXTS,
             ".safetensors",
         ),
     ] = None,
@@ -56,7 +74,6 @@ def principled(
     """
     if output is not None:
         files.try_file(output)
-    from nma.export.mitsuba import principled_dict, principled_xml
     from nma.train.constant import CONSTANT, fit_constant
 
     tables, record = reading.tables_of(source, material, walks, seed)
@@ -65,8 +82,7 @@ def principled(
         recipe = replace(recipe, steps=steps)
     with console.TrainingBar(recipe, "fitting") as bar:
         fit = fit_constant(tables, recipe, record, progress=bar.update)
-    description = principled_dict(fit.principled)
-    print(_json(description))
+    print(_json(fit.principled), end="")
     error = fit.figures["albedo_error"]
     console.say(
         f"log loss {fit.log_loss:.5f} over the table, albedo error {error:.4f}",
@@ -78,8 +94,7 @@ def principled(
     if output.suffix == ".safetensors":
         fit.adapter.save(output)
     else:
-        text = principled_xml(fit.principled) if output.suffix == ".xml" else _json(description) + "\n"
-        files.write_bytes(output, text.encode())
+        files.write_text(output, _TEXTS[output.suffix](fit.principled))
     console.say(f"wrote {output}")
 
 
@@ -91,7 +106,3 @@ def _warning(error: float, brightness: float) -> str:
         f"warning: an albedo error of {error:.4f} is above {ALBEDO_LIMIT:g} ({abs(percent):.1f} % too {tone} in all): "
         "one plain Principled BRDF cannot show this material; an adapter can, which `nma fit` makes"
     )
-
-
-def _json(description: dict[str, Any]) -> str:
-    return json.dumps(description, indent=2)

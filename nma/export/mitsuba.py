@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from nma.errors import ParamError
@@ -56,6 +57,11 @@ def principled_xml(p: Principled) -> str:
     lines.append(f'    <rgb name="base_color" value="{colour}"/>')
     lines += [f'    <float name="{key}" value="{value!r}"/>' for key, value in description.items()]
     return "\n".join((*lines, "</bsdf>", ""))
+
+
+def principled_json(p: Principled) -> str:
+    """The dictionary as a JSON file."""
+    return json.dumps(principled_dict(p), indent=2) + "\n"
 
 
 def _rounded(x: float) -> float:
