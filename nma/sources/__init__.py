@@ -36,7 +36,7 @@ def get(name: str) -> Source:
     return _FACTORIES[name]()
 
 
-# Where the format of a file is declared, by the file's extension: a module of this folder, and a name in it.
+# The formats, by file extension. Each is given as a module of this folder and the name of its `Format` there.
 FORMATS = {
     ".binary": "merl:FORMAT",
     ".bsdf": "mitsuba_bsdf:MEASURED",

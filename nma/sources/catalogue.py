@@ -16,7 +16,7 @@ from nma import sources
 from nma.errors import SourceError
 
 MEASUREMENTS = tuple(m for form in sources.formats().values() for m in form.measurements)
-# The formats of their files, by extension.
+# The formats in which measurements are published, by file extension.
 _FORMATS = {ending: form for ending, form in sources.formats().items() if form.measurements}
 _ENDINGS = ", ".join(sorted(_FORMATS))
 # Size and checksum of original files, by name.

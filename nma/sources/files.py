@@ -1,4 +1,4 @@
-"""Files with the values of materials: what their formats declare, and how they are read."""
+"""Files with the values of materials: the declaration of their formats, and a function that reads their bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nma.sources.base import Values
 
 @dataclass(frozen=True)
 class Measurements:
-    """Measured materials that somebody has published, or neural reconstructions of them: `kind` says which.
+    """Published measurements of materials, or neural reconstructions of measurements. `kind` says which.
 
     `files` describes the files of a complete copy. `known` gives the size in bytes and the SHA-256 of a file by its
     name; files that we had no copy of are not in it.
@@ -31,10 +31,10 @@ class Measurements:
 class Format:
     """A format of files with the values of materials. All functions raise `SourceError` for a damaged file.
 
-    `read(path)` returns the values of a file's material. If a file holds several, `names(path)` lists them and
-    `read(path, name)` returns one of them. `measurements` are those that are published in this format.
-    `identify(path)` reads the whole file and returns the name of its measurements; `name` stands for it where the file
-    is damaged. `claims(path)` tells these files from others with the same extension.
+    `read(path)` returns the values of the material in a file. If a file holds several materials, `names(path)` lists
+    them, and `read(path, name)` returns the values of one. `measurements` are the measurements that are published in
+    this format. `identify(path)` reads the whole file and returns the name of its measurements. For a damaged file, the
+    format's `name` is used instead. `claims(path)` says whether a file with the right extension has this format.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Format:
 
 
 def content(path: Path, measurements: str) -> bytes:
-    """All bytes of a file of these measurements. Raises `SourceError` if the file cannot be read."""
+    """All bytes of a file. Raises `SourceError` if it cannot be read; `measurements` is a name for this message."""
     try:
         return path.read_bytes()
     except FileNotFoundError:

@@ -27,7 +27,7 @@ from nma.sources.half_difference import half_difference
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# By one material of each: a weights file that has it was fitted to these measurements.
+# The names of the measurements, each by one of its materials. A weights file with this material was fitted to them.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
@@ -102,7 +102,7 @@ def _identify(path: Path) -> str:
 
 
 def _claims(path: Path) -> bool:
-    """Other `.npz` files, such as tables, have no weights."""
+    """Whether an `.npz` file has weights. Other files, such as tables, have none."""
     try:
         with arrays(path) as f:
             return "weights" in f
