@@ -70,9 +70,14 @@ def test_a_class_is_sampled_trained_judged_and_prepared(bare, nma):
         f"simulate --material {bare} --walks 20000 -o steel.npz",
         "evaluate bare.safetensors --reference steel.npz",
         f"render {bare} --adapter bare.safetensors --size 8 --spp 1 -o steel.png",
+        f"fit {bare} --walks 20000 --steps 20 --network 1x8 -o alone.safetensors",
+        "fit steel.npz --steps 20 --network 1x8 -o same.safetensors",
     ):
         code, _, told = nma(*words.split())
         assert code == 0, (words, told)
     adapter = Adapter.load("bare.safetensors")
     assert (adapter.space, adapter.encoding) == (BARE, "raw")
+    for alone in map(Adapter.load, ("alone.safetensors", "same.safetensors")):
+        assert alone.space == BARE
+        np.testing.assert_allclose(alone.material, [0.2, 0.5, 0.6, 0.7])
     assert np.isfinite(adapter.numbers(BARE.sample(np.random.default_rng(0), 3), [0.2, 0.9])).all()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nma import files
 from nma.cli import console, options, reading, training
+
+if TYPE_CHECKING:
+    from nma.params import ParamSpace
+    from nma.table import Tables
 
 
 def register(app: typer.Typer) -> None:
@@ -47,7 +51,6 @@ def fit(
     Examples: [bold]nma fit gold-red-lacquer -o gold.safetensors[/bold],
     [bold]nma fit paper_white_rgb.bsdf -o paper.safetensors[/bold]
     """
-    from nma.params import LAYERED3
     from nma.table import Tables
     from nma.train.fit import fit as fit_one
     from nma.train.fit import recipe_for
@@ -68,14 +71,26 @@ def fit(
         learning_rate=learning_rate,
         seed=seed,
     )
+    space = _space(source, known) if isinstance(known, Tables) else None
     with console.TrainingBar(recipe) as bar:
-        if isinstance(known, Tables) and known.params.shape[1] == LAYERED3.size:
-            adapter, run = fit_material(LAYERED3, recipe, known.params[0], known, record, progress=bar.update)
+        if space and isinstance(known, Tables):
+            adapter, run = fit_material(space, recipe, known.params[0], known, record, progress=bar.update)
         else:
             adapter, run = fit_one(known, recipe, record, progress=bar.update)
     training.finish(adapter, run, output)
     if not isinstance(known, Tables):
         _compare(adapter, known)
+
+
+def _space(source: str, tables: Tables) -> ParamSpace | None:
+    """The class of the table's parameters. A reference file does not name it, but the number of columns may tell."""
+    from nma import materials, sources
+
+    if reading.is_material(source):
+        return materials.load(source).space
+    spaces = [sources.get(name).space for name in sources.names()]
+    fitting = [space for space in spaces if space.size == tables.params.shape[1]]
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def _compare(adapter, source) -> None:

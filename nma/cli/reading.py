@@ -57,7 +57,7 @@ def known_of(
     path = _path(source, material)
     if path.suffix == ".npz":
         return _reference(path, material) if _holds_tables(path) else _values(path, material)
-    if _is_material(source):
+    if is_material(source):
         return _simulated(source, walks, seed)
     return _values(path, None)
 
@@ -103,13 +103,13 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
         )
     if path.suffix == ".safetensors":
         return AdapterValues(Adapter.load(path), name=path.stem)
-    if _is_material(source):
+    if is_material(source):
         known, network = materials.load(source), Adapter.load(adapter)
         return AdapterValues(network, network.check(known.vector(), clamp)[0], known.name)
     return _values(path, material)[0]
 
 
-def _is_material(source: str) -> bool:
+def is_material(source: str) -> bool:
     """Whether this is a MATERIAL, by its name or by that of its file."""
     from nma import materials
 
