@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from adapter_cases import VARIANTS, random_adapter
+from bsdf_cases import load_error, texture
 from safetensors import safe_open
 from safetensors.numpy import save
 
@@ -308,18 +309,6 @@ def test_clamp_moves_inputs_to_the_training_range(weights):
     params = mi.traverse(mi.load_dict(description(weights, clamp=True)))
     params["alpha_top"] = 0.9
     params.update()
-
-
-def load_error(description):
-    with pytest.raises(RuntimeError) as e:
-        mi.load_dict(description)
-    return str(e.value)
-
-
-def texture(value, channels=1):
-    pixels = np.full((4, 8, channels), 0.5, np.float32)
-    pixels[2, 5] = value
-    return bitmap_texture(pixels)
 
 
 @pytest.mark.parametrize(

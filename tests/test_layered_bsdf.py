@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_cases import load_error, texture
 
 import nma.render
 from nma.jit import dr
@@ -109,18 +110,6 @@ def test_back_and_other_lobes_are_dark():
     assert dr.all(bsdf.eval(ctx, si, wo) == 0, axis=None)
     two = mi.load_dict({"type": "twosided", "material": LACQUER})
     assert dr.any(two.eval(ctx, si, -wo) > 0, axis=None)
-
-
-def load_error(description):
-    with pytest.raises(RuntimeError) as e:
-        mi.load_dict(description)
-    return str(e.value)
-
-
-def texture(value, channels=1):
-    pixels = np.full((4, 8, channels), 0.5, np.float32)
-    pixels[2, 5] = value
-    return bitmap_texture(pixels)
 
 
 @pytest.mark.parametrize(

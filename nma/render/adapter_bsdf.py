@@ -19,7 +19,7 @@ from typing import Any
 from nma import target
 from nma.adapter import Adapter, shipped, weights_file
 from nma.ops import Color, Vec3, select
-from nma.render.bsdf import define_base, mean_of_samples, vec3
+from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.render.curves import MIN_COS, Curves
 from nma.render.inputs import of_adapter
 from nma.target import Brdf
@@ -50,15 +50,11 @@ def define() -> type:
             self._curves = self._make_curves()
             self._recorded = _Recorded()
             super().__init__(props)
-            flags = [mi.BSDFFlags.Anisotropic] if self.adapter.anisotropic else []
-            self._declare(*flags, *([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
-
-        def traverse(self, callback: mi.TraversalCallback) -> None:
-            self.inputs.traverse(callback)
+            self._declare(*([mi.BSDFFlags.Anisotropic] if self.adapter.anisotropic else []))
 
         def parameters_changed(self, keys: Any = ()) -> None:
             try:
-                self.inputs.changed()
+                super().parameters_changed(keys)
             finally:  # what was refused is undone, but the rest is edited
                 if self._curves is not None:
                     self._curves.update(self.inputs.columns())
@@ -89,7 +85,7 @@ def define() -> type:
             wo, value, pdf = brdf.sample(vec3(si.wi), sample1, sample2.x, sample2.y)
             if self._from_light(ctx):
                 value = self._towards_camera(si, mi.Vector3f(*wo), active & (pdf > 0))
-            return self._sampled(wo, pdf, value * (1.0 / select(pdf > 0, pdf, 1.0)), active)
+            return self._sampled(wo, pdf, over(value, pdf), active)
 
         def _from_light(self, ctx) -> bool:
             """Whether the path came from the light, and that makes a difference."""
@@ -111,7 +107,7 @@ def define() -> type:
 
             def draw(k, *u):
                 _, value, pdf = brdf.sample(vec3(si.wi), *u)
-                return value * select(pdf > 0, 1.0 / select(pdf > 0, pdf, 1.0), 0.0)
+                return select(pdf > 0, over(value, pdf), 0.0)
 
             return mean_of_samples(draw, ALBEDO_POINTS, active)
 

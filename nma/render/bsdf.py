@@ -6,7 +6,7 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-from nma.ops import Color, Vec3, minimum
+from nma.ops import Color, Vec3, minimum, select
 
 # Mitsuba's variants that BSDFs written in Python run in: parameters are RGB, code is vectorised.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
@@ -21,7 +21,7 @@ def define_base() -> type:
     """The class below all our BSDFs, for Mitsuba's present variant.
 
     A BSDF of ours has `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`), these are
-    what `mi.traverse` and attributes show.
+    what `mi.traverse` and attributes show, and `differentiable` says whether derivatives reach them.
     Its `__init__` calls the one here when nothing can fail any more: from then on Dr.Jit knows the BSDF and calls it in
     all scenes, for as long as a traceback, say, keeps it.
     """
@@ -33,18 +33,29 @@ def define_base() -> type:
 
     class OneSided(mi.BSDF):
         inputs: Any = None
+        differentiable = True
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.serial = next(_serials)
 
         def _declare(self, *flags: mi.BSDFFlags) -> None:
-            """One component: glossy reflection on the front, with these flags besides."""
+            """One component: glossy reflection on the front, with these flags besides, and with that of textures."""
             both = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            if self.inputs is not None and self.inputs.textured:
+                both |= mi.BSDFFlags.SpatiallyVarying
             for flag in flags:
                 both |= flag
             self.m_components = [both]
             self.m_flags = both
+
+        def traverse(self, callback):
+            if self.inputs is not None:
+                self.inputs.traverse(callback, self.differentiable)
+
+        def parameters_changed(self, keys=()):
+            if self.inputs is not None:
+                self.inputs.changed()
 
         def eval(self, ctx, si, wo, active=True):
             return self.eval_pdf(ctx, si, wo, active)[0]
@@ -122,6 +133,11 @@ def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, ac
     start = (dr.select(active, mi.UInt32(0), points), zero, zero, zero)
     _, x, y, z = dr.while_loop(start, lambda k, *rest: k < points, body, label="albedo")
     return Color(x, y, z) * (1.0 / points)
+
+
+def over(value: Any, pdf: Any) -> Any:
+    """A value per density. Where the density is 0 it is the value as it is."""
+    return value * (1.0 / select(pdf > 0, pdf, 1.0))
 
 
 def vec3(v: Any) -> Vec3:

@@ -77,12 +77,13 @@ class Inputs:
             channels = [value] if param.size == 1 else [value.x, value.y, value.z]
         return [param.bounds(self.bounds).moved(c) for c in channels]
 
-    def traverse(self, callback: Any, flags: Any = None) -> None:
-        """Shows every input to `mi.traverse` under its name; differentiable unless `flags` say otherwise."""
+    def traverse(self, callback: Any, differentiable: bool) -> None:
+        """Shows every input to `mi.traverse` under its name."""
         import mitsuba as mi
 
+        flags = mi.ParamFlags.Differentiable if differentiable else mi.ParamFlags.NonDifferentiable
         for name, value in self.values.items():
-            callback.put(name, value, mi.ParamFlags.Differentiable if flags is None else flags)
+            callback.put(name, value, flags)
 
     def __str__(self) -> str:
         return ",\n".join(f"  {name} = {value}".replace("\n", "\n  ") for name, value in self.values.items())

@@ -16,7 +16,7 @@ from typing import Any
 
 from nma.ops import Color, select
 from nma.params import LAYERED3
-from nma.render.bsdf import blended, define_base, mean_of_samples, vec3
+from nma.render.bsdf import blended, define_base, mean_of_samples, over, vec3
 from nma.render.inputs import Inputs
 from nma.sources import layered_eval
 from nma.sources.base import walk
@@ -37,16 +37,12 @@ def define() -> type:
     source = Layered3()
 
     class Layered(define_base()):  # type: ignore[misc]
+        differentiable = False
+
         def __init__(self, props: mi.Properties) -> None:
             self.inputs = Inputs(LAYERED3, props)
             super().__init__(props)
-            self._declare(*([mi.BSDFFlags.SpatiallyVarying] if self.inputs.textured else []))
-
-        def traverse(self, callback: mi.TraversalCallback) -> None:
-            self.inputs.traverse(callback, mi.ParamFlags.NonDifferentiable)
-
-        def parameters_changed(self, keys: Any = ()) -> None:
-            self.inputs.changed()
+            self._declare()
 
         def to_string(self) -> str:
             return f"Layered[\n{self.inputs}\n]"
@@ -87,7 +83,7 @@ def define() -> type:
             """A direction of density `pdf`, and an estimate of the value there over it."""
             wo = mi.Vector3f(*layered_eval.sample(layers, vec3(si.wi), *u))
             value, pdf = self._estimate(layers, si, wo, active)
-            return wo, value / dr.select(pdf > 0, pdf, 1.0)
+            return wo, over(value, pdf)
 
         def _estimate(self, layers, si, wo, active):
             active = active & (wo.z > 0)

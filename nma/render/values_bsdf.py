@@ -13,7 +13,7 @@ from typing import Any
 
 from nma import sources, target
 from nma.ops import Color, select
-from nma.render.bsdf import define_base, mean_of_samples, vec3
+from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.sources.base import Values
 from nma.target import Blend, Principled
 
@@ -81,7 +81,7 @@ def define() -> type:
             """A direction, its density, and the value over it."""
             wo, _, _ = target.sample(_PROPOSAL, wi, *u)
             value, pdf = self._eval_pdf(wi, wo, active)
-            return wo, pdf, value * (1.0 / select(pdf > 0, pdf, 1.0))
+            return wo, pdf, over(value, pdf)
 
         def _eval_pdf(self, wi, wo, active):
             pdf = select(active, target.pdf(_PROPOSAL, wi, wo), 0.0)
