@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="small, short runs, to see that the benches work"
     )
-    parser.add_argument("--output", type=Path, help="folder of the results")
+    parser.add_argument("--output", type=Path, help="folder for the results")
     arguments = parser.parse_args()
     known = benches()
     if not arguments.names:

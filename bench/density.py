@@ -105,7 +105,7 @@ def plot(seconds: dict[str, Seconds], arguments: argparse.Namespace, path: Path)
         axes.set_xscale("symlog", linthresh=1.0, linscale=1.0)
         axes.set_xticks(arguments.sigma, [f"{sigma:g}" for sigma in arguments.sigma])
         axes.set(title=variant, xlabel="extinction $\\sigma_t$")
-        # Room for the legend above the curves.
+        # The legend needs room above the curves.
         axes.set_ylim(0.0, 1.6 * max(max(times.values()) for times in by_bsdf.values()))
         axes.grid(alpha=0.3)
         axes.legend(title="largest to smallest", fontsize="small", loc="upper left")

@@ -85,7 +85,7 @@ def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[
 def _turns(
     scenes: Mapping[str, Mapping[str, Any]], spp: int
 ) -> Callable[[str, int], tuple[Array, float, float]]:
-    """Returns a function of a scene's name and a seed that renders a frame; it returns what `timed` returns."""
+    """Returns a function of a scene's name and a seed. It renders a frame and returns the result of `timed`."""
     import mitsuba as mi
 
     if mi.variant() == SCALAR:
@@ -272,7 +272,7 @@ def parser(doc: str | None, size: int, spp: int, runs: int) -> argparse.Argument
     )
     made.add_argument("--quick", action="store_true", help="a small, short run, to see that the bench works")
     made.add_argument(
-        "--output", type=Path, help=f"folder of the results (default {OUTPUT}; quick: {OUTPUT}/quick)"
+        "--output", type=Path, help=f"folder for the results (default {OUTPUT}; quick: {OUTPUT}/quick)"
     )
     return made
 

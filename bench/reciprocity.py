@@ -58,7 +58,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--quick", action="store_true", help="few pairs and two materials, to see that the bench works"
     )
-    parser.add_argument("--output", type=Path, default=frames.OUTPUT, help="folder of the results")
+    parser.add_argument("--output", type=Path, default=frames.OUTPUT, help="folder for the results")
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.samples = 1 << 12

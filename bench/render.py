@@ -121,7 +121,14 @@ def converged_halves(description: dict[str, Any], spp: int) -> list[Array]:
 
 
 def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array]) -> dict[str, Any]:
-    """The figures of one BSDF; `halves` are two independent converged pictures of `layered`."""
+    """Returns the figures of one BSDF in one scene.
+
+    Args:
+        scene: the scene's name.
+        name: the BSDF's name.
+        measured: the frames of all BSDFs in this scene, by name.
+        halves: two independent converged pictures of `layered`.
+    """
     own, principled = measured[name], measured["principled"]
     variance, wall = own.variance, own.seconds
     figures: dict[str, Any] = {
@@ -162,7 +169,7 @@ def bias(row: dict[str, Any]) -> float | None:
 
 
 def line(row: dict[str, Any]) -> str:
-    """One line of the table."""
+    """Formats a row as one line of the printed table."""
     text = (
         f"{row['scene']:9} {row['bsdf']:19} {row['seconds']:7.2f} {row['seconds_ratio']:6.2f} {row['cpu']:6.2f} "
         f"{row['cpu_ratio']:6.2f} {row['compile']:9.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"

@@ -118,7 +118,7 @@ def drjit_nn(layers: list, many: np.ndarray) -> float:
 
 
 def best(call, repetitions: int) -> float:
-    """Seconds of the fastest call."""
+    """Calls a function several times, and returns the seconds of the fastest call."""
     least = float("inf")
     for _ in range(repetitions):
         began = time.perf_counter()

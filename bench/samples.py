@@ -36,7 +36,7 @@ def main() -> None:
     reference = frames.converged_teaser(described[scenes.SIMULATION], arguments)
     curves = measure(described, reference, arguments)
     print(table(curves))
-    print(f"the converged picture's own squared error, subtracted: {reference.noise:.1e}")
+    print(f"squared error of the converged picture, subtracted above: {reference.noise:.1e}")
     path = arguments.output / "samples.json"
     frames.write(path, head, arguments, reference_noise=reference.noise, curves=curves)
     plot(curves, arguments, path.with_suffix(".png"))
@@ -45,7 +45,9 @@ def main() -> None:
 def parse() -> argparse.Namespace:
     parser = frames.parser(__doc__, size=144, spp=1024, runs=3)
     parser.add_argument("--variant", default=frames.SCALAR)
-    parser.add_argument("--reference-spp", type=int, default=8192, help="samples of the converged picture")
+    parser.add_argument(
+        "--reference-spp", type=int, default=8192, help="samples per pixel of the converged picture"
+    )
     return frames.parse(parser, size=32, spp=16, runs=2, reference_spp=256)
 
 

@@ -110,7 +110,7 @@ def worn_silver() -> Subject:
 
 
 def patinated_copper() -> Subject:
-    """Copper under a verdigris of uneven tone that crumbles where it is thin."""
+    """Copper under verdigris. The verdigris has an uneven tone, and crumbles where it is thin."""
     rng = np.random.default_rng(3)
     large, fine = (
         periodic_noise(rng, TEXELS, period=period, slope=slope) for period, slope in ((0.3, 2.0), (0.06, 1.3))
@@ -124,7 +124,7 @@ def patinated_copper() -> Subject:
 
 
 def scratched_gold() -> Subject:
-    """Gold with finger prints and scratches below a smooth red lacquer that is thick in some places."""
+    """Gold with finger prints and scratches, below a smooth red lacquer of uneven thickness."""
     textures = procedural_textures(TEXELS, seed=7)
     amount = 0.15 + 0.5 * textures["sigma_t"]
     gold = nma.load_material("gold-red-lacquer")

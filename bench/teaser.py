@@ -58,7 +58,9 @@ def parse() -> argparse.Namespace:
     parser = frames.parser(__doc__, size=288, spp=64, runs=3)
     parser.add_argument("--variant", default=frames.SCALAR)
     parser.add_argument("--adapter", default=DEFAULT_ADAPTER, help="a shipped name or a weights file")
-    parser.add_argument("--reference-spp", type=int, default=2048, help="samples of the converged picture")
+    parser.add_argument(
+        "--reference-spp", type=int, default=2048, help="samples per pixel of the converged picture"
+    )
     return frames.parse(parser, size=72, spp=8, runs=2, reference_spp=128)
 
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 Arrow = tuple[str, str]
-Place = str | tuple[str, str, int]  # a box, or where an arrow passes a floor
+Place = str | tuple[str, str, int]  # a box, or the floor that an arrow passes: (upper box, lower box, floor)
 
 TRIES, SWEEPS = 60, 16
 # Weights of an arrow's pieces. A piece counts STRAIGHT times as much for each end that passes a floor instead of

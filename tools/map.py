@@ -46,7 +46,7 @@ WAY = (
 
 BOX, HEIGHT, GAP, RISE, PASSAGE, PORT = 210, 94, 14, 58, 16, 13  # px
 MARGIN, LABEL = 18, 20
-LETTERS, LINES = 26, 4  # of what a room is
+LETTERS, LINES = 26, 4  # of the text that says what a room is: letters per line, and lines
 STYLE = """\
 text { font-family: "Helvetica Neue", Helvetica, Arial, "DejaVu Sans", sans-serif; fill: #23303d }
 .name { font-family: Menlo, Consolas, "DejaVu Sans Mono", monospace; font-weight: bold; font-size: 16px }
@@ -88,9 +88,9 @@ class Plan(NamedTuple):
 
     floors: list[list[str]]
     imports: frozenset[Arrow]
-    steps: dict[Arrow, Step]  # by their upper and lower room
+    steps: dict[Arrow, Step]  # the key is the upper and the lower room of a step
     layout: Layout
-    ports: dict[tuple[Arrow, str], float]  # where an arrow meets a box, from the box's centre
+    ports: dict[tuple[Arrow, str], float]  # x of an arrow's end at a box, relative to the box's centre
     left: float
 
     def x(self, place: Place) -> float:
@@ -171,7 +171,7 @@ def _top(level: int) -> int:
 
 
 def _bands(p: Plan) -> list[str]:
-    """A stripe behind each floor, with its number."""
+    """Draws a stripe behind each floor, with the floor's number."""
     parts = []
     for level in range(len(p.floors)):
         top, width = _top(level) - 8, p.width - 2 * MARGIN
@@ -201,7 +201,7 @@ def _lines(text: str) -> list[str]:
 
 
 def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
-    """A line between two boxes, straight where it passes a floor."""
+    """Draws a line between two boxes. The line is straight where it passes a floor."""
     points = _points(p, arrow)
     if upwards:
         points.reverse()

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "nma"
 CONTRACT = "floors"
 
-Arrow = tuple[str, str]  # from the room that imports to the one that is imported
+Arrow = tuple[str, str]  # from the importing room to the imported room
 
 
 @cache

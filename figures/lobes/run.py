@@ -37,7 +37,7 @@ COLOURS = ("#d62728", "#2ca02c", "#1f5fd0")
 
 
 class Fit(NamedTuple):
-    """A material's reference (40, 40, 40, 3), each variant's table of that shape, and each variant's figures."""
+    """A material's reference table (40, 40, 40, 3), and the table (of the same shape) and figures of each variant."""
 
     reference: NDArray
     tables: dict[str, NDArray]

@@ -3,11 +3,11 @@
     python -m figures.measured.run [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
 
 Fits a 3x32 network to each material, as `nma fit` does, and compares the fit with the material itself: at 20,000 random
-pairs of directions and in a picture. The best constant Principled BRDF is compared in the same way. So are, for RGL's
-measurements, the NBRDF networks that Sztrajman et al. 2021 fitted to them. RGL's files and the NBRDF networks are not
-part of this repository. `--data` names the folder that has them, in `rgl` and `rgl_nbrdf`; materials without a file are
-left out. Writes measured.md, measured.json and measured.png beside this file; with --quick and little training, to
-out/figures/measured.
+pairs of directions and in a picture. Two other models are compared at the same pairs: the best constant Principled
+BRDF, and the NBRDF networks that Sztrajman et al. 2021 fitted to RGL's measurements. RGL's files and the NBRDF networks
+are not part of this repository. `--data` names the folder that has them, in `rgl` and `rgl_nbrdf`; materials without a
+file are left out. Writes measured.md, measured.json and measured.png beside this file; with --quick and little
+training, to out/figures/measured.
 """
 
 from __future__ import annotations

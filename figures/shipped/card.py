@@ -53,7 +53,7 @@ def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dic
     return f"""# {name}
 
 Written by `python -m figures.shipped.run`. This is an adapter for the class `{adapter.space.name}`. Its target is
-{adapter.variant}, energy {bound}. Its network is {recipe["network"]} with {count:,} parameters, encoding
+{adapter.variant}; its energy is {bound}. Its network is {recipe["network"]} with {count:,} parameters, encoding
 `{adapter.encoding}`.
 
 ## Training

@@ -48,7 +48,7 @@ class Size(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Pictures of the reference and the adapter, the adapter's metrics, and those of the reference's own noise."""
+    """Pictures of the reference and the adapter; the adapter's metrics, and the metrics of the reference's noise."""
 
     reference: np.ndarray
     adapter: np.ndarray

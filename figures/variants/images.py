@@ -23,7 +23,8 @@ REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
 
 
 class View(NamedTuple):
-    """How materials are rendered: the first `materials` of the validation set, at `size` x `size` pixels."""
+    """How materials are rendered: the first `materials` of the validation set, with `size` x `size` pixels, `spp`
+    samples per pixel for adapters and `reference_spp` for the simulation."""
 
     materials: int = 89
     size: int = 128
@@ -32,7 +33,8 @@ class View(NamedTuple):
 
 
 class Gallery:
-    """Pictures (materials, height, width, 3) of the reference and of adapters, kept in the store's folder."""
+    """Renders pictures (materials, height, width, 3) of the reference and of adapters, and keeps them in the store's
+    folder."""
 
     def __init__(self, store: Store, view: View, validation: str):
         self._store, self._view, self._validation = store, view, validation
@@ -46,7 +48,7 @@ class Gallery:
         return compare(self._simulated(self._view.spp, NOISE_SEED), self.reference)
 
     def metrics(self, job: Job, adapter: nma.Adapter) -> dict[str, float]:
-        """The image metrics of an adapter, means over the materials."""
+        """The image metrics of an adapter, averaged over the materials."""
         settings = {"view": self._view._asdict(), "validation": self._validation}
         return self._store.cached(
             job, "images", settings, adapter, lambda: compare(self.pictures(job, adapter), self.reference)
@@ -91,7 +93,7 @@ class Gallery:
 
 
 def compare(pictures: Images, references: Images) -> dict[str, float]:
-    """Means of all metrics over the materials."""
+    """All image metrics, averaged over the materials."""
     found = [nma.compare_images(a, b) for a, b in zip(pictures, references, strict=True)]
     return {name: round(float(np.mean([f[name] for f in found])), 7) for name in METRICS}
 

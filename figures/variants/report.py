@@ -99,7 +99,7 @@ def loss_table(losses: dict[str, dict[str, Any]]) -> str:
 def ordering_lines(found: dict[str, dict[str, list[bool]]]) -> str:
     """A table that says for how many seeds the paper's ordering holds."""
     if not found:
-        return "No size has all variants yet."
+        return "No dataset size has results of all variants yet."
     lines = [["", *next(iter(found.values()))]]
     for figure, row in found.items():
         lines.append([figure, *(f"{sum(holds)} of {len(holds)} seeds" for holds in row.values())])

@@ -89,7 +89,7 @@ class Store:
         return self._dataset.load()
 
     def check(self, sizes: list[int]) -> None:
-        """Raises an error if the dataset has fewer materials than one of the sizes."""
+        """Raises an error if a size is not between 1 and the number of materials in the dataset."""
         most = self._dataset.settings.materials
         if min(sizes) < 1 or max(sizes) > most:
             raise NmaError(
