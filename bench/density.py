@@ -5,9 +5,9 @@ python -m bench.density [--variant scalar_rgb llvm_ad_rgb] [--scene environment]
 
 The material is a nearly white medium between a coat and silver. The medium hardly absorbs, so walks end only when they
 leave the material. The training range ends at sigma_t = 1. Beyond it the adapter clamps, because this bench needs its
-time and not its picture. BSDFs and extinctions take turns, and this repeats --runs times; times are medians. `nma
-curves` runs the network when the scene is loaded, `nma online` at every shading point. Flatness is the largest time
-over all extinctions, divided by the smallest.
+time and not its picture. Each of the --runs rounds renders all BSDFs at all extinctions in turns; times are medians.
+`nma curves` runs the network when the scene is loaded, `nma online` at every shading point. Flatness is the largest
+time over all extinctions, divided by the smallest.
 
 Writes density.json and density.png.
 """

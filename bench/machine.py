@@ -15,7 +15,7 @@ def header() -> str:
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        # Virtual machines often hide the processor's name. The family tells more: AMD's 25 is Zen 3 or 4, 26 is Zen 5.
+        # Virtual machines often hide the processor's name. AMD's family 25 is Zen 3 or 4, its family 26 is Zen 5.
         fields = dict(re.findall(r"^(.*?)\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE))
         names = [
             fields.get("model name"),

@@ -16,8 +16,8 @@ Arrow = tuple[str, str]
 Place = str | tuple[str, str, int]  # a box, or the floor that an arrow passes: (upper box, lower box, floor)
 
 TRIES, SWEEPS = 60, 16
-# Weights of an arrow's pieces. A piece counts STRAIGHT times as much for each end that passes a floor instead of
-# meeting a box, so long arrows are straight.
+# A piece of an arrow pulls its two ends together. The pull is STRAIGHT times as strong for each end that is not a box,
+# so that long arrows are straight where they pass floors.
 STRAIGHT = 6.0
 
 
