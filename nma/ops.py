@@ -128,6 +128,7 @@ def maximum(a: Float, b: Float) -> Float:
 
 
 def clip(x: Float, low: float, high: float) -> Float:
+    """`x`, moved to the nearer of `low` and `high` where it is outside."""
     return minimum(maximum(x, low), high)
 
 
@@ -145,6 +146,7 @@ def select(condition: Mask, a: Float, b: Float) -> Float:
 
 
 def copysign(magnitude: Float, sign: Float) -> Float:
+    """The absolute value of `magnitude`, negative where `sign` < 0."""
     return select(sign < 0, -absolute(magnitude), absolute(magnitude))
 
 
@@ -163,6 +165,7 @@ def detach(x: Float) -> Float:
 
 
 def lerp(a: Float, b: Float, t: Float) -> Float:
+    """Linear interpolation: `a` for t = 0, `b` for t = 1."""
     return a + (b - a) * t
 
 
@@ -224,10 +227,12 @@ def cross(a: Vec3, b: Vec3) -> Vec3:
 
 
 def normalize(v: Vec3) -> Vec3:
+    """The unit vector along `v`, which must not be 0."""
     return v * (1.0 / sqrt(dot(v, v)))
 
 
 def max_component(c: Vec3) -> Float:
+    """The largest of the three components."""
     return maximum(maximum(c.x, c.y), c.z)
 
 

@@ -52,6 +52,7 @@ class TrainingBar:
         self._bar.__exit__(*args)
 
     def update(self, run: Any) -> None:
+        """Shows the progress of the training `run`."""
         if self._first is None:
             self._first, self._began = run.step, time.perf_counter()
             self._bar.update(self._task, completed=run.step)

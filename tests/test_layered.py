@@ -123,7 +123,7 @@ def compare(values, seed, factor=1.0):
 
 @pytest.mark.parametrize("case", CASES)
 def test_evaluation_equals_walks(case):
-    """They agree in every bin that enough walks reach. For narrow lobes, hardly any walk reaches the far bins."""
+    """Evaluation and walks agree in every bin that enough walks reach. Few walks reach bins far from a narrow lobe."""
     z = compare(CASES[case], seed=3)
     assert z.size > 0.2 * GRID.bins
     assert np.abs(z).max() < limit(z.size), f"z {np.abs(z).max():.1f} beyond {limit(z.size):.1f}"

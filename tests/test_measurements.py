@@ -1,4 +1,4 @@
-"""`nma data`: its list, and its check of a user's copies."""
+"""`nma data` lists the public measurements and checks a user's copies of them."""
 
 import shutil
 from functools import partial

@@ -139,7 +139,7 @@ def test_the_azimuth_goes_round():
 
 
 def test_what_was_not_measured_is_left_out():
-    """A uniform material with missing entries stays uniform. It is black where all neighbours are missing."""
+    """A uniform material with missing entries stays uniform. The material is black where all neighbours are missing."""
     rng = np.random.default_rng(5)
     uniform = np.where(rng.random(SHAPE) < 0.3, -0.5, 1500.0)
     uniform[40:] = -1.0

@@ -24,7 +24,7 @@ def square(n):
 
 
 def normals(alpha_x, alpha_y, n=400):
-    """Normals and weights such that weighted sums are integrals against D cos(theta). They are dense in the long tail.
+    """Normals and weights such that weighted means are integrals against D cos(theta). The long tail has many normals.
 
     Slopes follow P(|slope / alpha| > t) = 1 / (1 + t^2), which is (1 - v)^4 here.
     """

@@ -223,7 +223,7 @@ def test_means_of_a_lobe_of_alpha_001_are_exact(lobe_means):
 
 
 def test_a_few_crowded_points_see_what_uniform_points_miss(lobe_means):
-    """For the mean of the mirror bin from 20 points, uniform points have a far larger standard deviation."""
+    """An estimate of the mirror bin's mean from 20 points has a far larger standard deviation if they are uniform."""
     mirror = np.array(LOBE_BINS[:1], np.float64)
     spread = []
     for law in (crowded, uniform):

@@ -33,9 +33,9 @@ COSINES = (0.0, 1e-30, 1e-12, 1e-8, 1e-7, 1e-5, 1e-3)
 
 
 def grazing(cosines, n=500):
-    """Pairs in which one direction or both have one of the `cosines`.
+    """Pairs of directions. In each pair, one direction or both have one of the `cosines`.
 
-    Their azimuths are equal, opposite, or 1 rad apart.
+    The azimuths of a pair are equal, opposite, or 1 rad apart.
     """
     rng, pairs = np.random.default_rng(0), []
     for cosine in cosines:
@@ -63,7 +63,7 @@ def test_values_at_the_horizon_are_finite(name):
 
 @pytest.mark.parametrize("name", ("paper_white", "cg_sunflower"))
 def test_measured_values_at_the_horizon_are_finite(measurements, name):
-    """At the horizon, values are not larger than a little above it, where the whole forward peak is visible."""
+    """Values at the horizon hardly exceed the largest value slightly above it, which is that of the forward peak."""
     source = sources.read(measurements / "rgl" / f"{name}_rgb.bsdf")
     peak = numbers(source.eval(*grazing((1e-4, 1e-3, 1e-2)))).max()
     assert_finite(source, 1.1 * peak)

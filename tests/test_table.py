@@ -211,7 +211,7 @@ def test_launches_of_an_anisotropic_table_continue_each_other(monkeypatch):
 
 
 def test_no_bin_overflows():
-    """All walks of a row end in one bin with throughput 1. There are more of them than one launch may count."""
+    """All walks of a row end in one bin with throughput 1. There are more walks than one launch may count."""
 
     class Up(Scatter):
         def draw(self, wi, u1, u2):

@@ -214,7 +214,7 @@ def test_a_table_as_a_source_knows_its_bins():
     "grid", (Grid(20, 20, 20), Grid(12, 12, 24, phi_i=24)), ids=("isotropic", "anisotropic")
 )
 def test_a_smooth_table_has_no_steps(grid):
-    """It reproduces a function that is linear in the cosines, except in the outer halves of the outermost bins."""
+    """A smooth table reproduces a linear function of the cosines, except in the outer halves of the outermost bins."""
     tables = tabulate_values(Formula(lambda wi, wo: Color.of(wi.z * 0.5 + wo.z)), grid=grid)
     rough, smooth = TableValues(tables), TableValues(tables, smooth=True)
     wi, wo = pairs(5000)

@@ -44,7 +44,7 @@ def albedo(mu, n=WALKS, seed=1, **values):
 
 
 def assert_equal_means(found, error, expected):
-    """Two-sided Z-tests that compare each number in `found`, with its standard error, with `expected`."""
+    """Two-sided Z-tests of the numbers `found`, which have the standard errors `error`, against `expected`."""
     found, error, expected = np.broadcast_arrays(found, error, expected)
     z = np.abs(found - expected) / np.maximum(error, 1e-6)
     limit = norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / z.size)))
@@ -68,7 +68,7 @@ def test_perfect_mirror_under_smooth_coat_ends():
 
 
 def test_bare_rough_conductor():
-    """Albedos of single scattering on a white conductor at normal incidence. They are from quadrature.
+    """For single scattering on a white conductor at normal incidence, quadrature gives the albedo.
 
     For alpha 1, the albedo is 1 - ln 2.
     """

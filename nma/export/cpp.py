@@ -79,6 +79,7 @@ def _field(name: str, kind: str) -> str:
 
 
 def print_function(function: Function) -> str:
+    """The function as a C++ function template."""
     arguments = ", ".join(f"{_argument(kind)} {name}" for name, kind in function.arguments)
     head = f"inline {_type(function.returns)} {function.name}({arguments}) {{"
     body = [_line(function, node) for node in function.body]

@@ -84,6 +84,7 @@ class Function:
     def unsupported(
         self, node: ast.AST, what: str, remedy: str = "write it with arithmetic and `ops`"
     ) -> Unsupported:
+        """The error for a construct that cannot be exported, with its file and line."""
         place = f"{self.module.__file__}:{getattr(node, 'lineno', '?')}"
         return Unsupported(f"{place}: {what} cannot be exported; {remedy}")
 

@@ -1,10 +1,10 @@
 """Compiles the C++ runtime on this machine: the plugins for Mitsuba's scalar renderer, and the shared library that
 `nma.native.runtime` calls.
 
-The result is kept in the user's cache folder. The name of its subfolder has a digest of the C++ sources and of the
-versions they are compiled against. So a newer version of this package or of Mitsuba compiles again, and never loads
-files that do not fit. The compiler is the one named in `CXX`, else c++, g++ or clang++. Linux is tested, macOS should
-work, and Windows is refused.
+The compiled files are kept in the user's cache, in a subfolder whose name has a digest of the C++ sources and of the
+versions that they are compiled against. So they are compiled again after an update of this package or of Mitsuba, and
+files that do not fit are never loaded. The compiler is the one named in `CXX`, else c++, g++ or clang++. Linux is
+tested, macOS should work, and Windows is refused.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from nma.files import whole_folder
 
 PLUGINS = ("nma", "layered")
 _ADAPTERS = Path(__file__).parent.parent / "adapter" / "trained"
-# The flags with which Mitsuba's wheel was compiled. Function calls pass vectors differently for each instruction set: a
-# plugin compiled for another one loads, but returns nonsense.
+# The flags with which Mitsuba's wheel was compiled. The instruction set decides how function calls pass vectors: with
+# another instruction set, a plugin loads, but returns nonsense.
 _MITSUBA_FLAGS = (
     *(["-march=haswell"] if platform.machine() in ("x86_64", "AMD64") else []),
     *("-std=c++20", "-O2", "-fPIC", "-shared", "-fvisibility=hidden"),
@@ -59,13 +59,13 @@ def has_mitsuba_plugins() -> bool:
 
 
 def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
-    """Compiles the plugins `nma` and `layered` for `scalar_rgb` against the installed Mitsuba, unless that is done.
+    """Compiles the plugins `nma` and `layered` for `scalar_rgb` against the installed Mitsuba, unless they exist.
 
     Args:
         say: a function that is called with a line of text for each step.
 
     Returns:
-        The folder to put on Mitsuba's resource path. It also has the shipped adapters.
+        The folder to put on Mitsuba's resource path. The folder also has the shipped adapters.
 
     Raises:
         MissingDependencyError: there is no compiler, or no nanobind, whose headers Dr.Jit's headers include.
@@ -99,7 +99,10 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
 
 
 def library() -> Path:
-    """The shared library of the C interface, compiled unless that is done. Raises the errors of `build_mitsuba`."""
+    """The path of the shared library of the C interface, which is compiled if it does not exist.
+
+    Raises the errors of `build_mitsuba`.
+    """
     folder, name = _cache() / f"library-{_digest()}", f"nma_c{_suffix()}"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", f"-I{sources()}"]
     if not folder.exists():

@@ -106,6 +106,7 @@ class _Detour:
     total: Float
 
     def offer(self, walk: Walk, rng: Random) -> _Detour:
+        """Chooses the current segment of `walk` instead, with a chance in proportion to its brightest channel."""
         weight = ops.select(walk.alive, ops.max_component(throughput(walk)), 0.0)
         total = self.total + weight
         take = rng.next_float32() * total < weight

@@ -44,6 +44,7 @@ class Grid:
 
     @property
     def bins(self) -> int:
+        """The number of pairs of a bin of wi and a bin of wo."""
         return self.rows * self.theta_o * self.phi_o
 
     @property

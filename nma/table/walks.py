@@ -74,7 +74,7 @@ def stream_keys(seed: int, indices: NDArray[np.integer] | Sequence[int]) -> NDAr
 def _tabulate_group(
     source: Source, params: NDArray, keys: NDArray, sweeps: int, grid: Grid, error: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Values and standard errors, each (n, bins, 3), from `sweeps` walks in every row.
+    """Values and standard errors, each (n, bins, 3), from a number of sweeps. A sweep is one walk from every row.
 
     The sweeps are divided into launches short enough that no bin overflows.
     """
@@ -85,7 +85,7 @@ def _tabulate_group(
     if not error:
         return moments[0] / weight, None
     sums, squares = moments
-    # If all walks of a row hit a bin with the same throughput, their variance is 0. Then use that of a single hit.
+    # If all walks of a row hit a bin with the same throughput, their variance is 0. Use that of a single hit instead.
     variance = np.maximum(squares - sums * sums / sweeps, squares / sweeps)
     return sums / weight, np.sqrt(variance) / weight
 
