@@ -81,7 +81,7 @@ def fit(name: str, quick: bool) -> Fit:
 def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
     """A slice of a table (theta_i, theta_o, phi, 3) in the plane of incidence, for an angle of wi in degrees.
 
-    Returns the angles of wo [radians], positive on the side of the mirror direction, and the values (2 theta_o, 3).
+    Returns the angles of wo [radians], positive on the side of the mirror direction, and the values (angles, 3).
     """
     bins = table.shape[1]
     theta = np.arccos((np.arange(bins) + 0.5) / bins)
