@@ -170,7 +170,10 @@ def lerp(a: Float, b: Float, t: Float) -> Float:
 
 
 class Vec3(NamedTuple):
-    """A direction or an RGB colour: three arrays of equal shape, with elementwise arithmetic."""
+    """A direction or an RGB colour: three arrays of equal shape, with elementwise arithmetic.
+
+    Dr.Jit does not look into named tuples: `dr.eval(*v)` evaluates the three arrays, `dr.eval(v)` nothing.
+    """
 
     x: Float
     y: Float

@@ -70,7 +70,7 @@ def fine_means(adapter, bins, points=1 << 11, repeats=6):
         found = quadrature.bin_points(i, o, p, tuple(Float(x.ravel().astype(np.float32)) for x in u))
         brdf = adapter.prepare([Float(0.5)] * 13, found.wi)
         value = brdf.eval(found.wi, found.wo) * found.weight
-        dr.eval(value)
+        dr.eval(*value)
         means.append(np.stack([c.numpy().reshape(points, -1).mean(axis=0) for c in value], axis=-1))
     return np.mean(means, axis=0), np.std(means, axis=0, ddof=1) / math.sqrt(repeats)
 

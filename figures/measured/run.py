@@ -198,13 +198,13 @@ def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
         return Vec3(sin * dr.cos(6.2831853 * turn), sin * dr.sin(6.2831853 * turn), mu)
 
     wi, wo = direction(*lanes[:2]), direction(*lanes[2:])
-    dr.eval(wi, wo)
+    dr.eval(*wi, *wo)
     times: list[list[float]] = [[] for _ in models]
     for _ in range(repetitions + 1):
         for model, spent in zip(models, times, strict=True):
             began = time.perf_counter()
             value = model.eval(wi, wo)
-            dr.eval(value)
+            dr.eval(*value)
             dr.sync_thread()
             spent.append(time.perf_counter() - began)
     return [min(spent[1:]) / TIMED_PAIRS * 1e9 for spent in times]

@@ -137,7 +137,7 @@ def _by_samples(
     value = value * dr.select(pdf > 0, _sharpness(pdf) / dr.maximum(pdf, 1e-9), 0.0)
     directions = len(cosines) // grid.theta_i
     index = bin_index(at // directions, UInt32(0), wo, grid)
-    dr.eval(index, value)
+    dr.eval(index, *value)
     # Summed by NumPy, in a fixed order.
     sums = [np.bincount(index.numpy(), c.numpy(), grid.bins) for c in value]
     return np.stack(sums, axis=-1) / (directions * _SAMPLES * grid.solid_angle)
