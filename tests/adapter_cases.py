@@ -1,4 +1,4 @@
-"""Untrained adapters, and materials for them. Several test files share these."""
+"""Untrained adapters and random materials, which several test files share."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What the tests of BSDFs share: an image with one odd pixel, and the error of a description."""
+"""Helpers for the tests of BSDFs: a texture with one special pixel, and the error of a faulty description."""
 
 import mitsuba as mi
 import numpy as np
@@ -8,14 +8,14 @@ from nma.render.textures import bitmap_texture
 
 
 def load_error(description):
-    """What `mi.load_dict` says of a description that it refuses."""
+    """Returns the error message with which `mi.load_dict` refuses a description."""
     with pytest.raises(RuntimeError) as e:
         mi.load_dict(description)
     return str(e.value)
 
 
 def texture(value, channels=1):
-    """An image of .5 with `value` at x=5, y=2."""
+    """Returns a texture of .5 everywhere, but with `value` in the pixel at x=5, y=2."""
     pixels = np.full((4, 8, channels), 0.5, np.float32)
     pixels[2, 5] = value
     return bitmap_texture(pixels)

@@ -12,7 +12,7 @@ from material_cases import PLAIN
 from nma import cli, llvm
 
 # Tests keep compiled code in a cache of their own, apart from the user's. All workers, programs and runs of the tests
-# share it. The digest of the sources names each folder in it.
+# share this cache. The name of each folder in the cache is the digest of its sources.
 CACHE = Path(__file__).parents[1] / "build/tests"
 os.environ["XDG_CACHE_HOME"] = str(CACHE)
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "jax")
@@ -38,7 +38,7 @@ def old_library(tmp_path: Path) -> str:
 
 @pytest.fixture(scope="session")
 def compiler() -> str:
-    """The path of a C++ compiler. Tests that need one are skipped on machines without it."""
+    """The path of a C++ compiler. Tests that need a compiler are skipped on machines without one."""
     found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if found is None:
         pytest.skip("there is no C++ compiler here")
@@ -49,7 +49,7 @@ def compiler() -> str:
 def measurements() -> Path:
     """The folder of measured materials: NMA_TEST_DATA, or shared/data beside the checkout.
 
-    The repository holds no measurements. Tests that need them are skipped without them.
+    The repository holds no measurements. Tests that need measurements are skipped if this folder is missing.
     """
     named = os.environ.get("NMA_TEST_DATA")
     folder = Path(named or Path(__file__).parents[2] / "shared/data")

@@ -1,4 +1,4 @@
-"""Chi-square tests of samples against a density over the hemisphere. Several test files share them."""
+"""Chi-square tests of samples against a density over the hemisphere, which several test files share."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ GRID_POINTS = BINS[0] * BINS[1] * PARTS**2
 def p_values(sample: Callable, density: Callable) -> tuple[float, float]:
     """Returns two p-values: of the samples against their density, and of the samples against a wrong density.
 
-    The error of the wrong density rises from -10 % in the first bin to +10 % in the last. A test must reject it.
+    The wrong density must be rejected. Its error rises from -10 % in the first bin to +10 % in the last one.
     `sample(n)` returns directions (n, 3) and densities (n,). A density of 0 marks a direction below the horizon; all
     such directions share one extra bin. `density(wo)` returns the densities of directions (n, 3).
     """

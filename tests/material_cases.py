@@ -1,4 +1,4 @@
-"""The text of a material file, and a function that writes images. Several test files share them."""
+"""The text of a material file and a function that writes images, which several test files share."""
 
 from pathlib import Path
 

@@ -5,8 +5,8 @@ import numpy as np
 from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 
-# Arguments of `jax.jit` for tests that spend most of their time on compiling. They turn off the slow steps, because
-# XLA otherwise fuses the target into large kernels.
+# Arguments of `jax.jit` for tests that spend most of their time on compiling. These options turn off slow steps of
+# XLA, above all the fusion of the target into large kernels.
 FAST_COMPILE = {
     "compiler_options": {
         "xla_disable_hlo_passes": "fusion,cpu-instruction-fusion",
@@ -21,7 +21,7 @@ def random_principled(
 ) -> Principled:
     """Returns n random parameter sets. Widths spread over decades, and many parameters are exactly 0 or 1.
 
-    `dialect` adds the parameters that the paper leaves out, `fades` those that Mitsuba's BSDF does not have.
+    `dialect` adds parameters that the paper leaves out. `fades` adds parameters that Mitsuba's BSDF does not have.
     """
 
     def often_pure():
@@ -57,7 +57,7 @@ def random_blend(
 
 
 def random_directions(rng: np.random.Generator, n: int) -> Vec3:
-    """Returns n random directions above the horizon, uniform in the cosine. Every tenth is near grazing."""
+    """Returns n random directions above the horizon, uniform in the cosine. Every tenth direction is near grazing."""
     z = rng.random(n)
     z = np.where(rng.random(n) < 0.1, 10.0 ** rng.uniform(-6, -1, n), z)
     phi = rng.uniform(0, 2 * np.pi, n)

@@ -1,4 +1,4 @@
-"""Adapters of every kind prepare a BRDF with its frame. Its methods agree for every azimuth of the view direction."""
+"""Adapters of every kind prepare a BRDF with its frame. The methods of the BRDF agree for every azimuth of the view."""
 
 import math
 from dataclasses import replace

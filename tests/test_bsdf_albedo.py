@@ -1,4 +1,4 @@
-"""Our BSDFs report their directional albedo at wi to denoisers and to `aov`. It is at most 1 and free of noise."""
+"""Our BSDFs report their directional albedo at wi to denoisers and `aov`. This albedo has no noise and is at most 1."""
 
 import mitsuba as mi
 import numpy as np

@@ -65,7 +65,7 @@ def test_channels_have_the_names_of_what_they_hold(nma, tmp_path, pixels, integr
         depth = values[..., found.index("d.T")]
         assert depth[4, 4] == pytest.approx(5.0, abs=0.1) and depth[0, 0] == 0
     if {"R", "Y", "X"} & set(found):
-        # In the corner the camera sees the sky. The picture holds its luminance if it is grey, else its colour.
+        # The corner of the picture shows the sky: its luminance in grey formats, its colour in other formats.
         grey = "luminance" in pixels
         sky = np.full(3, np.dot(SKY, (0.2126, 0.7152, 0.0722))) if grey else np.array(SKY)
         np.testing.assert_allclose(read_image(tmp_path / "a.exr")[0, 0], sky, rtol=1e-3)

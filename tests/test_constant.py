@@ -35,7 +35,7 @@ def red() -> Tables:
 
 @pytest.fixture(scope="module")
 def coated(red) -> Tables:
-    """The same values, with parameters of a layered material, so that the table belongs to the class `layered3`."""
+    """The table of `RED` with the parameters of a layered material, so that it belongs to the class `layered3`."""
     return Tables(LAYERED3.sample(np.random.default_rng(0), 1), red.values, red.walks)
 
 
@@ -135,8 +135,8 @@ def instances() -> list[Principled]:
 def test_mitsuba_evaluates_the_export_to_the_same(p, form):
     """Mitsuba's values of the exported BSDF equal ours within 2e-4 relative, away from the horizon.
 
-    The gloss of the clearcoat is limited to 0.8, because narrower clearcoats lose digits in single precision, as
-    tests/test_target.py explains. A failure means that the export writes a wrong parameter.
+    The gloss of the clearcoat is limited to 0.8, because Mitsuba loses digits of narrower clearcoats in single
+    precision. A failure means that the export writes a wrong parameter.
     """
     p = p._replace(clearcoat_gloss=min(p.clearcoat_gloss, 0.8))
     bsdf = from_dict(principled_dict(p)) if form == "dictionary" else from_string(principled_xml(p))
@@ -168,7 +168,7 @@ def test_parameters_that_mitsuba_does_not_allow_are_refused(change):
 
 @pytest.fixture
 def fitted(fit, monkeypatch) -> list[tuple]:
-    """Makes the command return `fit` for every input. The fixture is the list of (tables, record) that it received."""
+    """Makes the command return `fit` for every input. The value is the list of (tables, record) given to the fit."""
     given = []
 
     def find(tables, recipe, record, **options):
@@ -183,7 +183,7 @@ def fitted(fit, monkeypatch) -> list[tuple]:
 def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monkeypatch, tmp_path):
     """The command prints the result of `fit_constant`, because equal arguments give equal results.
 
-    Its table here belongs to no class: the fit needs no parameters of the material.
+    The table in this test belongs to no class, because the fit needs no parameters of the material.
     """
     monkeypatch.setattr("nma.train.constant.CONSTANT", SHORT)
     red.save(tmp_path / "red.npz")

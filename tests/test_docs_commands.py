@@ -1,4 +1,4 @@
-"""Tests of the commands in the documentation pages: `nma` parses all, and runs those of each page in their order."""
+"""`nma` parses every command in the documentation pages, and the commands of each page run one after the other."""
 
 import re
 import shlex
@@ -98,7 +98,7 @@ def test_the_makefile_has_every_goal_that_pages_name():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with the files that readers of the pages are assumed to have, all but the measured materials."""
+    """A folder with the files that commands of the pages read, except for the measured materials."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "home/merl").mkdir(parents=True)

@@ -25,7 +25,7 @@ def contents(folder: Path) -> list[str]:
 
 @pytest.fixture
 def places(tmp_path) -> dict[str, Path]:
-    """Paths that cannot be written. The keys are words of the error that each must raise."""
+    """Paths that cannot be written. Each key is a part of the error message that writing to its path must raise."""
     (tmp_path / "folder.npz").mkdir()
     (tmp_path / "file").write_text("mine")
     return {
@@ -111,7 +111,10 @@ WRITERS = {
 
 @pytest.mark.parametrize("writer", WRITERS)
 def test_a_full_disk_raises_one_line_and_leaves_no_file(tmp_path, monkeypatch, writer):
-    """Every writer uses `whole`, whose last step fails here as on a full disk: one line is raised, no file remains."""
+    """On a full disk the error of every writer is one line, and no file remains.
+
+    Every writer uses `whole`. Its last step, `Path.replace`, fails here.
+    """
     monkeypatch.setattr(Path, "replace", _full)
     with pytest.raises(OutputError, match="No space left on device.*free some space"):
         WRITERS[writer](tmp_path / "a.png")

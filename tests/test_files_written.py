@@ -1,4 +1,4 @@
-"""All code writes files by `nma.files`, completely or not at all. The tests search the code for other ways."""
+"""All code writes files by `nma.files`, completely or not at all. The tests search for other calls that write."""
 
 import ast
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 # Methods and functions that write, rename or copy files, on any object and in any module.
 WRITERS = {"write_text", "write_bytes", "save_file", "savez", "savez_compressed", "savefig", "tofile"}
 WRITERS |= {"NamedTemporaryFile", "mkstemp", "mkdtemp", "rename", "copytree", "copyfile", "copy2", "move"}
-# Functions that write or rename files, with their modules. Their names alone would match other functions.
+# Functions that write or rename files, with their modules, because the names alone are also those of other functions.
 OF_MODULES = {"np.save", "json.dump", "os.replace"}
 # Blocks of these context managers fill a temporary file or folder, which gets its final name at the end.
 WHOLE = {"whole", "whole_folder"}

@@ -30,7 +30,7 @@ def test_equal_images_have_no_error(picture):
 
 
 def test_plain_errors_follow_their_formulas():
-    """The expected errors are computed by hand, from a = 3 and b = 1 in every pixel and channel and eps = .01."""
+    """The expected errors are computed by hand for an image of 3, a reference image of 1, and eps = .01."""
     result = errors(np.full((2, 2, 3), 3.0), np.full((2, 2, 3), 1.0))
     expected = {"l1": 2.0, "l2": 4.0, "mape": 2 / 1.01, "smape": 4 / 4.01, "mrse": 4 / 1.01}
     assert result == pytest.approx(expected, rel=1e-9)

@@ -282,13 +282,13 @@ def test_white_furnace():
     }
     result = measure(mi.load_dict(description), 1024, 6, warmup=False)
     one = np.ones_like(result.mean)
-    # Even facets this narrow mask .1 % of the light, which grazes them below the coat.
+    # Even at this small roughness, facets mask about .1 % of the light, at grazing angles below the coat.
     same = zscore_images(result.mean, result.variance, 6, one, 0 * one, 1, rounding=1e-3, false_alarm=1e-3)
     assert same.passed, f"p {same.p_values.min():.1e} below {same.level:.1e} at {same.worst}"
 
 
 def test_a_scene_s_composites_do_not_depend_on_the_scenes_loaded_before():
-    """`blended` tells whether a BSDF is part of a composite, even if names and addresses of an older scene recur."""
+    """`blended` is right about a BSDF even if a BSDF of an older scene had the same name and address."""
     blend = {"type": "blendbsdf", "weight": 0.5, "a": LACQUER, "b": {"type": "diffuse"}}
     kept = []
     for composite in (True, False, True, True, False, False):

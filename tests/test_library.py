@@ -38,12 +38,12 @@ TINY = replace(
     steps=250,
 )
 CODING = replace(TINY, steps=150, learning_rate=5e-2)
-# Training must reach this log loss within 250 steps. It starts above .02.
+# Training must reach this log loss within 250 steps. The initial log loss is above .02.
 REACHED = 0.003
 
 
 def matte(rho):
-    """Returns noise-free tables of Lambertian materials with albedos `rho` (n, 3). Their parameter is their index."""
+    """Returns noise-free tables of Lambertian materials with albedos `rho` (n, 3). The only parameter is the index."""
     cosines = (np.arange(40) + 0.5) / 40
     values = rho[:, None, None, None, :] / math.pi * cosines[None, None, :, None, None]
     values = np.broadcast_to(values, (len(rho), *ISOTROPIC.shape)).astype(np.float32)
@@ -144,7 +144,7 @@ def test_encoding_a_new_material_beats_the_nearest_code(library, tables):
     for (matrix, bias), (before, bias_before) in zip(library.adapter.layers, layers, strict=True):
         np.testing.assert_array_equal(matrix, before)
         np.testing.assert_array_equal(bias, bias_before)
-    # The nearest code to each material of the library is its own.
+    # Each material of the library is nearest to its own code.
     nearest = [
         np.argmin(training._judge(library.codes, library, tables[k : k + 1], CODING)) for k in range(3)
     ]

@@ -133,8 +133,8 @@ def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
     assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
 
 
-# Prints five colours for each random pair of directions: f for a camera path, f for a light path, f for a camera path
-# with swapped directions, weight times pdf of a sample, and the value of the direction of this sample.
+# Prints five colours for each random pair of directions. Three are values of f: for a camera path, for a light path,
+# and for a camera path with swapped directions. Two belong to a sample: weight times pdf, and the value of `eval_pdf`.
 SCALAR = """
     rng = np.random.default_rng(0)
     light = mi.BSDFContext(mi.TransportMode.Importance)

@@ -96,7 +96,7 @@ def test_multijittered_samples_fill_a_grid(spp, pixels, capfd):
 
 
 def test_the_command_asks_for_no_sample_count_that_mitsuba_warns_of(capfd):
-    """Mitsuba would warn of 128 samples, which fill no grid. The command asks for two passes of 64, which fill one."""
+    """Mitsuba would warn of 128 samples, which fill no grid. Two passes of 64 samples fill grids without a warning."""
     view = View((192, 192), 128, 6, "hero", "studio", None, "llvm_ad_rgb")
     assert sampler(128, 192 * 192) == "multijitter"
     view.load(load_material("wet-nickel"), "layered")

@@ -111,7 +111,7 @@ def test_a_material_becomes_a_dictionary_for_either_bsdf():
 def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
     """With `uv_scale = 3` an image repeats three times along u.
 
-    That holds for a material that a scene names by its file, and for one that is given as a dictionary.
+    The material is named by its file in a scene, or given as a dictionary.
     """
     pixels = np.zeros((1, 8, 3), np.uint8)
     pixels[:, 2:4, 0] = 255
@@ -129,7 +129,7 @@ def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
 
 @pytest.mark.parametrize("model", ["nma", "layered"])
 def test_textures_of_eight_bits_are_checked_by_the_values_they_evaluate_to(model, tmp_path):
-    """Byte 20 evaluates to .078 if the texture is `raw`, otherwise to .007 in linear light. Both values are accepted.
+    """Byte 20 is accepted, because it evaluates to .078 if the texture is `raw`, and to .007 in linear light otherwise.
 
     The adapter accepts `alpha_top` from .001 to .316, so that byte 0 is refused.
     """

@@ -123,7 +123,7 @@ def test_an_image_without_colour_channels_is_refused_with_the_names_of_its_chann
 
 
 def test_images_repeat_as_often_as_the_file_says(material_file, tmp_path):
-    """A texture with a `uv_scale` repeats as that says. All others, also added ones, repeat as the material says."""
+    """The `uv_scale` of a material holds for all of its textures that have none of their own, also for added ones."""
     write_image(tmp_path / "image.png", PACKED)
     both = "alpha_bottom = { texture = 'image.png', channel = 'g', uv_scale = 2.5 }\nalbedo = { texture = 'image.png' }"
     path = material_file("alpha_bottom = 0.2", both)

@@ -151,7 +151,7 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_fault(material_file, old
     assert len(str(error.value)) < 1000 and "\n" not in str(error.value)
 
 
-# Values, keys and fragments of text. The next test writes them into a good file, in place of its keys and values.
+# Values, keys and fragments of text that the next test writes into a good file, in place of its keys and values.
 NASTY = (
     "0.5",
     "1",
@@ -193,7 +193,7 @@ NASTY += ("[" * 3000, "1" * 400, "1" * 5000, "0x" + "f" * 9000, '"' + "a" * 5000
 def test_any_file_either_loads_or_is_refused_in_one_line(material_file):
     """400 random faulty files either load or raise one short line.
 
-    Each is a good file with one or two keys or values replaced, and sometimes with a piece cut out.
+    Each faulty file is a good one with one or two keys or values replaced, and sometimes with a piece cut out.
     """
     path, rng = material_file(), np.random.default_rng(0)
     good = [re.split("( = )", line) for line in path.read_text().strip().splitlines()]

@@ -1,4 +1,4 @@
-"""The compiled plugins for Mitsuba's scalar renderer check their inputs, and accept edits and queries of them."""
+"""The compiled plugins for Mitsuba's scalar renderer check inputs, render edits, and return inputs as attributes."""
 
 import dataclasses
 import math
@@ -34,7 +34,10 @@ EDITS = """
 
 @pytest.mark.parametrize("kind", ["nma", "layered"])
 def test_edits_are_rendered_at_once_or_refused(kind):
-    """An edit of a number, a colour or pixels takes effect at once. A bad value stops all rendering until corrected."""
+    """An edit of a number, a colour or pixels takes effect at once. A bad value is refused.
+
+    After a refused edit nothing is rendered until a correct value replaces the bad one.
+    """
     finished(
         EDITS
         + """
@@ -164,7 +167,7 @@ end_header
 def test_attributes_of_a_mesh_are_clamped_to_the_range(kind, tmp_path):
     """Vertex colours beyond the range render like the constant 1, alone and inside a checkerboard.
 
-    Loading cannot check them, because only the mesh knows their values.
+    Loading cannot check these colours, because only the mesh has their values.
     """
     (tmp_path / "plate.ply").write_text(PLATE)
     colours = {"type": "mesh_attribute", "name": "vertex_color"}

@@ -78,7 +78,7 @@ def test_scalar_and_vectorised_plugins_render_the_same():
 
 
 def test_scalar_and_vectorised_plugins_render_anisotropic_adapters_the_same(tmp_path):
-    """Both plugins render the same picture. It differs from that of an adapter that ignores the azimuth."""
+    """Both plugins render the same picture. An adapter that ignores the azimuth has a different picture."""
     adapter = random_anisotropic_adapter()
     (matrix, bias), *rest = adapter.layers
     blind = dataclasses.replace(adapter, layers=[(matrix * np.float32([1, 0, 0, 0, 0]), bias), *rest])
@@ -134,9 +134,9 @@ def test_composites_are_linear_combinations_of_their_parts():
 
 
 def test_diffuse_reflectance_is_the_directional_albedo(tmp_path):
-    """The diffuse reflectance of a BSDF is its albedo at wi: the mean weight of 20,000 samples, within a tolerance.
+    """The diffuse reflectance of a BSDF equals the mean weight of 20,000 samples at wi, within a tolerance.
 
-    It is the same for equal arguments, at most 1, and 0 from behind.
+    The reflectance has no noise, is at most 1, and is 0 from behind.
     """
     random_anisotropic_adapter().save(tmp_path / "brushed.safetensors")
     finished(

@@ -1,4 +1,4 @@
-"""The preview scene: geometry, framing, parameter names, lights and textures. Also the measuring of renders."""
+"""The preview scene (geometry, framing, parameter names, lights, textures), and the measuring of renders."""
 
 from pathlib import Path
 
@@ -189,7 +189,7 @@ def test_textures_depend_on_the_seed_alone(textures):
 
 
 def test_textures_tile(textures):
-    """The difference of pixels across the border is no larger than differences of neighbours inside."""
+    """Pixels on opposite borders differ at most 1.5 times as much as neighbouring pixels inside."""
     for texture in textures.values():
         for axis in (0, 1):
             inside = np.abs(np.diff(texture, axis=axis)).mean(axis=1 - axis)

@@ -1,4 +1,4 @@
-"""An adapter of one material records its parameters. It needs none, and refuses those of another material."""
+"""An adapter of one material records its parameters. Users may leave them out, and other parameters are refused."""
 
 import json
 import math

@@ -31,7 +31,7 @@ def drjit_single(tree):
 
 
 def lobe_directions(rng, blend, wi):
-    """Samples one direction per lane from the blend. Random directions replace those below the horizon."""
+    """Samples one direction per lane from the blend. Random directions replace samples below the horizon."""
     wo, _, _ = target.sample(blend, wi, *rng.random((3, wi.z.size)))
     fallback = random_directions(rng, wi.z.size)
     return ops.select(wo.z > 1e-6, wo, fallback)
@@ -88,7 +88,7 @@ def test_eval_equals_mitsuba_principled():
     rng = np.random.default_rng(11)
     n = 10_000
     p = to_single(random_principled(rng, n))
-    # A tenth of the sets have alpha at its lower bound of .001, and a tenth have it below.
+    # A tenth of the sets have alpha at its lower bound of .001, and a tenth have a smaller alpha.
     floor = rng.random(n)
     rough = np.where(floor < 0.1, np.sqrt(np.float32(0.001)), np.where(floor > 0.9, 0.01, p.roughness))
     p = p._replace(roughness=rough.astype(np.float32).astype(np.float64))
@@ -275,7 +275,7 @@ def test_derivatives_equal_finite_differences():
 def test_single_precision_keeps_its_digits():
     """Dr.Jit and JAX in single precision equal NumPy in double precision within 2e-5 relative, also in the peaks.
 
-    All get the same inputs, which are rounded to single precision.
+    All three get the same inputs, which are rounded to single precision.
     """
     rng = np.random.default_rng(18)
     n = 100_000

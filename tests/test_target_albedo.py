@@ -20,9 +20,9 @@ SAMPLES = 2048
 
 
 def estimate(blend, mu):
-    """Estimates the albedos of CASES blends at the cosines `mu` (CASES,). Returns them and their standard errors.
+    """Estimates the albedos of CASES blends, and their standard errors, at the cosines `mu` (CASES,).
 
-    Both results have the shape (3, CASES). The parameters of `blend` are NumPy arrays (CASES,).
+    Albedos and errors have the shape (3, CASES). The parameters of `blend` are NumPy arrays (CASES,).
     """
     lane = dr.arange(dr.auto.UInt32, CASES * SAMPLES)
     case, k = lane // SAMPLES, lane % SAMPLES

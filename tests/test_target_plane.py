@@ -1,4 +1,4 @@
-"""The frame of the plane of incidence is a rotation about the normal. `enter` rotates into it, `leave` back."""
+"""The frame of the plane of incidence is a rotation about the normal. `leave` is the inverse of `enter`."""
 
 import numpy as np
 

@@ -126,7 +126,7 @@ def draw_lobes(cases, count, seed):
 
 
 def adaptive_bins(boxes, a, b):
-    """Cuts `boxes` (n, 1, 4) into boxes (n, 2^FINE, 4) of equally many samples. Returns them and the cuts per level."""
+    """Cuts `boxes` (n, 1, 4) into boxes with equal counts. Returns boxes (n, 2^FINE, 4) and the cuts per level."""
     n = len(boxes)
     points = np.stack([a.numpy(), b.numpy()], -1).reshape(n, 1, -1, 2)
     cuts = []

@@ -141,9 +141,9 @@ def test_a_fit_approaches_what_it_fits():
 
 @pytest.mark.slow
 def test_the_paper_s_preset_runs(tables):
-    """The preset `paper` has the settings of the paper, and trains.
+    """The preset `paper` has the settings of the paper, and a training with it runs.
 
-    They are batches of 1000 bins, 20 uniform points per bin, raw inputs, and Adam with a learning rate of 1e-5.
+    These are batches of 1000 bins, 20 uniform points per bin, raw inputs, and Adam with a learning rate of 1e-5.
     """
     assert (PAPER.rows, PAPER.bins_per_row, PAPER.points) == (1000, 1, 20)
     assert (PAPER.points_law, PAPER.bins_law, PAPER.loss) == ("uniform", "uniform", "log")

@@ -79,7 +79,7 @@ def test_a_batch_holds_the_values_of_the_tables(tables):
 def test_weights_undo_the_choice_of_anisotropic_bins():
     """Weighted means over drawn bins equal means over uniform bins also for anisotropic tables (Z-tests).
 
-    Their rows depend on cosine and azimuth of `wi`. Half of the bins are drawn around the mirror direction.
+    Rows of such tables depend on cosine and azimuth of `wi`. Half of the bins are drawn around the mirror direction.
     """
     grid, rng, n = Grid(theta_i=10, theta_o=20, phi_o=40, phi_i=20), np.random.default_rng(8), 20_000
     sampler = BinSampler("mirror", grid)
@@ -95,7 +95,7 @@ def test_weights_undo_the_choice_of_anisotropic_bins():
 
 
 def test_albedos_within_a_row_are_interpolated(tables):
-    """`albedo_at` is exact for albedos that are linear in the cosine. Its mean over a row is that of the table."""
+    """`albedo_at` is exact for albedos linear in the cosine. Its mean over a row equals that of the table."""
     pool = Pool.of(tables)
     rows, offsets = np.arange(40), (np.arange(8) + 0.5) / 8
     linear = replace(pool, albedo=np.tile((0.1 + (rows + 0.5) / 50)[None, :, None], (6, 1, 3)))

@@ -34,7 +34,7 @@ def parts(path):
 
 
 def refusal(path):
-    """Returns the message by which `Adapter.load` refuses a file. It must be one line and name the file."""
+    """Returns the message by which `Adapter.load` refuses a file. The message must be one line and name the file."""
     with pytest.raises(WeightsError) as caught:
         Adapter.load(path)
     message = str(caught.value)
