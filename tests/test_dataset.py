@@ -240,7 +240,7 @@ def test_a_material_beyond_the_last_is_refused(whole):
 def test_a_dataset_without_a_sound_description_is_refused_with_advice(copy):
     (copy.path / "zarr.json").write_text('{"shape": [\n')
     with pytest.raises(
-        DatasetError, match="is not a dataset.*damaged.*delete it.*`nma dataset CLASS"
+        DatasetError, match="is not a dataset.*damaged.*deleted and made again.*`nma dataset CLASS"
     ) as caught:
         Dataset.create(copy.path, SETTINGS)
     assert "\n" not in str(caught.value)

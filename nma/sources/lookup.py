@@ -17,7 +17,7 @@ from nma.ops import Float
 
 
 class Lookup:
-    """A grid in d dimensions whose cells have the shape (n_1, ..., n_d, channels).
+    """A regular grid in d dimensions. Its `cells` are an array of shape (n_1, ..., n_d, channels).
 
     A position is measured in cells: 0 .. n_k in dimension k. A `periodic` dimension wraps around. In the other
     dimensions a position beyond an end means the cell at that end. Positions may be Dr.Jit arrays with or without

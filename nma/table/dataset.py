@@ -124,7 +124,7 @@ class Dataset:
         except Exception as e:
             advice = f"`nma dataset CLASS {path}` makes one"
             if os.path.exists(path / "zarr.json"):
-                advice = f"choose another folder or, if it is a damaged dataset, delete it: {advice} anew"
+                advice = f"choose another folder; a damaged dataset can be deleted and made again: {advice}"
             reason = str(e).partition("\n")[0] or type(e).__name__
             raise DatasetError(f"{path} is not a dataset of tables ({reason}); {advice}") from None
         if settings.format != FORMAT:
