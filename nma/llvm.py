@@ -16,7 +16,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-# With AVX-512, libLLVM 15 and 16 kill Dr.Jit 1.5 (at `fmaximum`). 17, 18, 19 and 22 rendered the same picture.
+# With AVX-512, Dr.Jit 1.5 aborts in libLLVM 15 and 16 (at `fmaximum`). 17, 18, 19 and 22 rendered the same picture.
 MIN_VERSION = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 NEED = f"Dr.Jit needs {MIN_VERSION} or later to compile for the CPU"

@@ -111,7 +111,10 @@ def evaluated_table(values, per_row, seed):
 
 
 def compare(values, seed, factor=1.0):
-    """The z-scores of evaluation (times `factor`) minus walks, for bins with over 100 walks and for sums of rows."""
+    """The z-scores of the difference between evaluation (times `factor`) and walks.
+
+    There is one for each bin with over 100 walks, and one for the sum of each row.
+    """
     walks = tabulate(Layered3(), vector(values)[None], 1 << 20, stream_keys(seed, range(1)), grid=GRID)
     found, error = evaluated_table(values, 1 << 17, seed)
     enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100

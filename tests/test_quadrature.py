@@ -223,7 +223,7 @@ def test_means_of_a_lobe_of_alpha_001_are_exact(lobe_means):
 
 
 def test_a_few_crowded_points_see_what_uniform_points_miss(lobe_means):
-    """An estimate of the mirror bin's mean from 20 points has a far larger standard deviation if they are uniform."""
+    """Estimates of the mirror bin's mean from 20 points vary far more if the points are uniform."""
     mirror = np.array(LOBE_BINS[:1], np.float64)
     spread = []
     for law in (crowded, uniform):

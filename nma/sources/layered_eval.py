@@ -118,7 +118,7 @@ class _Detour:
         )
 
     def chosen(self) -> tuple[Vec3, Color]:
-        """The segment's direction, and its throughput divided by the chance of its choice."""
+        """The segment's direction, and its throughput divided by the probability that it was chosen."""
         return Vec3(*self.direction), Color(*self.tint) * self.total
 
 

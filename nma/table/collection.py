@@ -76,8 +76,8 @@ def tables(
 ) -> Tables:
     """The tables of the materials `chosen`, in that order.
 
-    Each table is saved in `folder` once it is made, so that a killed run can go on. It is used again only for a file of
-    the same content, not for another file of the same name. `params` (n, 1) of the tables are the materials' positions
+    Each table is saved in `folder` once it is made, so that a killed run can go on. A later call uses a saved table
+    only if the material's file still has the same content. `params` (n, 1) of the tables are the materials' positions
     in `chosen`. Raises `SourceError` if a file cannot be read, and `TableError` if a material is anisotropic.
     """
     digests: dict[Path, str] = {}
