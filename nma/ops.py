@@ -35,7 +35,7 @@ class _Python:
 _PYTHON = _Python()
 
 
-def library(*args: Any) -> str:
+def backend(*args: Any) -> str:
     """The array package that the arguments belong to: "drjit", "jax", "numpy", or "python" for plain numbers."""
     for a in args:
         module = type(a).__module__
@@ -49,7 +49,7 @@ def library(*args: Any) -> str:
 
 def _module(*args: Any) -> Any:
     """The module with the operations for the arguments. Dr.Jit and JAX are imported only if an argument needs them."""
-    owner = library(*args)
+    owner = backend(*args)
     if owner == "drjit":
         import drjit
 
@@ -152,7 +152,7 @@ def copysign(magnitude: Float, sign: Float) -> Float:
 
 def detach(x: Float) -> Float:
     """The value of `x` as a constant, through which no derivative is propagated."""
-    owner = library(x)
+    owner = backend(x)
     if owner == "drjit":
         import drjit
 

@@ -74,5 +74,5 @@ def mapped(tree, f):
 
 
 def stacked(c: Vec3) -> np.ndarray:
-    """Converts a triple of arrays of any array library to a NumPy array (3, ...)."""
+    """Converts a triple of arrays of any array package to a NumPy array (3, ...)."""
     return np.stack(np.broadcast_arrays(*(np.asarray(x) for x in c)))

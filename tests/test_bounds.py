@@ -211,5 +211,5 @@ def test_cpp_allows_the_same_values(adapter):
     for steps, known in ((0.5, True), (3, False)):
         for name, value in beyond("training", steps):
             row = LAYERED3.vector(PLAIN | {name: value}).astype(np.float32)
-            found = runtime._library.nma_check(runtime._handle, pointer(row))
+            found = runtime._c.nma_check(runtime._handle, pointer(row))
             assert (found == -1) == known, (name, value)

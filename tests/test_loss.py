@@ -45,7 +45,7 @@ def tables():
     ("law", "kind"), [("crowded", "principled"), ("uniform", "principled"), ("crowded", "stretched")], ids=str
 )
 def test_bin_means_in_jax_are_the_tables_of_the_evaluation(tables, law, kind):
-    """The same target averaged over the same bins by two libraries, two sets of points and two programs."""
+    """The same target averaged over the same bins by two array packages, two sets of points and two programs."""
     params, stretched = target.TARGETS[kind], kind == "stretched"
     across = BRASS.instances[0]._replace(anisotropic=-3.0 if stretched else 0.0)
     blend = BRASS._replace(instances=(across, BRASS.instances[1]))

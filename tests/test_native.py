@@ -43,13 +43,13 @@ def test_plugins_are_named_and_linked_as_the_platform_wants(monkeypatch, tmp_pat
     monkeypatch.setattr(build, "_compile", lambda words, flags: compiled.append((words[-1].name, flags[-1])))
     build.build_mitsuba()
     assert compiled == [(f"nma{suffix}", flag), (f"layered{suffix}", flag)]
-    assert build.library().name == f"nma_c{suffix}"
+    assert build.shared_library().name == f"nma_c{suffix}"
 
 
 def test_windows_is_refused_in_one_line(monkeypatch, tmp_path):
     monkeypatch.setattr(build.sys, "platform", "win32")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for compiles in (build.build_mitsuba, build.library):
+    for compiles in (build.build_mitsuba, build.shared_library):
         with pytest.raises(build.BuildError, match="cannot be compiled on Windows, .* WSL") as e:
             compiles()
         assert "\n" not in str(e.value)

@@ -88,7 +88,7 @@ def test_the_raw_encoding_is_the_paper_s_input():
     assert encoding.raw(columns, None) == columns
 
 
-def test_encodings_agree_on_all_libraries():
+def test_encodings_agree_on_all_array_packages():
     """Plain floats, NumPy and Dr.Jit give the same numbers."""
     params, mu = materials(50), np.linspace(0.0, 1.0, 50)
     on_numpy = np.stack(np.broadcast_arrays(*encoding.layered3(list(params.T), at_azimuth_0(mu))), axis=-1)

@@ -137,9 +137,7 @@ def test_single_queries_and_batches_make_the_same_materials(name):
         many = loaded.prepare(params, cosines)
         each = np.zeros_like(many)
         for material, numbers, cosine in zip(each, params, cosines, strict=True):
-            loaded._library.nma_prepare(
-                loaded._handle, pointer(numbers), ctypes.c_float(cosine), pointer(material)
-            )
+            loaded._c.nma_prepare(loaded._handle, pointer(numbers), ctypes.c_float(cosine), pointer(material))
         many, each = (np.column_stack(loaded.eval_pdf(materials, wi, wo)) for materials in (many, each))
         tolerance = 1e-2 if instruction_set == "avx512_bf16" else 1e-3
         np.testing.assert_allclose(many, each, rtol=tolerance, atol=1e-5)
@@ -182,7 +180,7 @@ def test_curves_follow_the_network():
     wi = facing(cosines)
     u = np.random.default_rng(9).random((CASES, 3), np.float32)
     loaded = Runtime("layered3-5x64")
-    library = loaded._library
+    library = loaded._c
     library.nma_curves_new.restype = ctypes.c_void_p
     for material in params[:5]:
         exact = loaded.prepare(np.tile(material, (CASES, 1)), cosines)
@@ -267,17 +265,17 @@ def test_parameters_beyond_the_training_range_are_refused_or_moved():
         wanted = f"row 7: {loaded.names[column]} is {value:g}, allowed is {low[column]:g} "
         with pytest.raises(nma.errors.ParamError, match=re.escape(wanted)):
             loaded.prepare(beyond, cosines)
-        assert loaded._library.nma_check(loaded._handle, pointer(beyond[7])) == column
+        assert loaded._c.nma_check(loaded._handle, pointer(beyond[7])) == column
         moved = params.copy()
         moved[7, column] = high[column] if value > high[column] else low[column]
         if np.isfinite(value):
             found = loaded.outputs(beyond, cosines, clamp=True)
             np.testing.assert_array_equal(found, loaded.outputs(moved, cosines))
-        loaded._library.nma_clamp(loaded._handle, pointer(beyond[7]))
+        loaded._c.nma_clamp(loaded._handle, pointer(beyond[7]))
         np.testing.assert_array_equal(beyond, moved)
     with pytest.raises(nma.errors.ParamError, match="row 0: albedo is nan"):
         loaded.prepare(params * np.where(np.arange(13) == 9, np.nan, 1), cosines, clamp=True)
-    assert loaded._library.nma_check(loaded._handle, pointer(params[0])) == -1
+    assert loaded._c.nma_check(loaded._handle, pointer(params[0])) == -1
 
 
 def test_an_instruction_set_that_this_cpu_lacks_falls_back():
@@ -286,14 +284,14 @@ def test_an_instruction_set_that_this_cpu_lacks_falls_back():
     loaded = Runtime("layered3-3x32", absent[0])
     assert loaded.instruction_set == "portable"
     message = ctypes.create_string_buffer(100)
-    assert not loaded._library.nma_load(b"none", len(INSTRUCTION_SETS), message, 100)
+    assert not loaded._c.nma_load(b"none", len(INSTRUCTION_SETS), message, 100)
     assert message.value == b"no such instruction set"
 
 
 def test_an_adapter_in_memory_is_the_one_of_its_file():
     loaded, data = Runtime("layered3-3x32"), weights_file("layered3-3x32").read_bytes()
     params, cosines = queries(15)
-    library = loaded._library
+    library = loaded._c
     library.nma_from_memory.restype = ctypes.c_void_p
     handle = ctypes.c_void_p(library.nma_from_memory(data, ctypes.c_size_t(len(data)), 0, None, 0))
     found = np.zeros((CASES, loaded.size), np.float32)

@@ -99,7 +99,7 @@ def test_single_queries_and_batches_make_the_same_materials(case):
         many = runtime.prepare(none(), wi)
         each = np.zeros_like(many)
         for material, row in zip(each, wi, strict=True):
-            runtime._library.nma_prepare_direction(runtime._handle, None, pointer(row), pointer(material))
+            runtime._c.nma_prepare_direction(runtime._handle, None, pointer(row), pointer(material))
         many, each = (np.column_stack(runtime.eval_pdf(m, wi, wo)) for m in (many, each))
         tolerance = 1e-2 if instruction_set == "avx512_bf16" else 1e-3
         np.testing.assert_allclose(many, each, rtol=tolerance, atol=1e-5)
@@ -109,7 +109,7 @@ def test_a_cosine_alone_stands_for_azimuth_zero(case):
     runtime = Runtime(case[1])
     cosines = np.random.default_rng(7).uniform(0.02, 1, CASES).astype(np.float32)
     many, one = np.zeros((CASES, runtime.size), np.float32), np.zeros((1, runtime._brdf), np.float32)
-    library, handle = runtime._library, runtime._handle
+    library, handle = runtime._c, runtime._handle
     library.nma_outputs_many(handle, CASES, None, pointer(cosines), pointer(many))
     np.testing.assert_allclose(many, runtime.outputs(none(), facing(cosines)), rtol=1e-4, atol=1e-4)
     library.nma_prepare(handle, None, ctypes.c_float(cosines[0]), pointer(one))
@@ -174,5 +174,5 @@ def test_there_are_no_curves(case, curves):
     done = subprocess.run([curves, case[1]], capture_output=True, text=True, check=True)
     assert "anisotropic" in done.stdout and "prepare by direction" in done.stdout
     runtime = Runtime(case[1])
-    runtime._library.nma_curves_new.restype = ctypes.c_void_p
-    assert runtime._library.nma_curves_new(runtime._handle, None) is None
+    runtime._c.nma_curves_new.restype = ctypes.c_void_p
+    assert runtime._c.nma_curves_new(runtime._handle, None) is None

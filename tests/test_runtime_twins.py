@@ -110,7 +110,7 @@ def test_a_single_material_is_known_by_the_same_tolerance(tmp_path):
             given = known.copy()
             given[column] += factor * SAME * scale
             numbers = given.astype(np.float32)
-            known_to_c = runtime._library.nma_check(runtime._handle, pointer(numbers)) == -1
+            known_to_c = runtime._c.nma_check(runtime._handle, pointer(numbers)) == -1
             assert known_to_c == accepted
             for call in (lambda x=given: adapter.check(x), lambda x=given: runtime.prepare([x], [0.5])):
                 if accepted:

@@ -1,4 +1,4 @@
-"""The target equals Mitsuba's `principled`, obeys its laws, and computes the same in all libraries and precisions."""
+"""The target equals Mitsuba's `principled`, obeys its laws, and is the same in all array packages and precisions."""
 
 import warnings
 
@@ -269,7 +269,7 @@ def test_derivatives_equal_finite_differences():
             assert float(jnp.max(jnp.abs(difference - exact[:, k]) / scale)) < 1e-5
 
 
-# ---- Array libraries and precisions ----------------------------------------------------------------------------------
+# ---- Array packages and precisions -----------------------------------------------------------------------------------
 
 
 def test_single_precision_keeps_its_digits():
@@ -296,7 +296,7 @@ def test_single_precision_keeps_its_digits():
     np.testing.assert_allclose(from_jax, expected, rtol=2e-5)
 
 
-def test_samples_are_the_same_in_every_library():
+def test_samples_are_the_same_in_every_array_package():
     rng = np.random.default_rng(19)
     n = 20_000
     blend, wi = to_single(random_blend(rng, n, 3)), to_single(random_directions(rng, n))

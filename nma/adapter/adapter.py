@@ -180,7 +180,7 @@ class Adapter:
         meaning.
         """
         inputs = encoding.get(self.encoding)(columns, wi if self.directional else None)
-        if ops.library(*columns, wi.z) == "drjit":
+        if ops.backend(*columns, wi.z) == "drjit":
             raw = network.forward_lanes(self.layers, inputs, active)
         else:
             lanes = np.broadcast_arrays(wi.z, *inputs)[1:]

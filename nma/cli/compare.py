@@ -59,7 +59,7 @@ def compare(
     from nma.images import metrics
     from nma.images.io import read_image
 
-    metrics.ensure_libraries()
+    metrics.ensure_packages()
     if output:
         files.try_file(output)
     if reference is not None:

@@ -33,7 +33,7 @@ def demo(
     """
     from nma.images import metrics
 
-    metrics.ensure_libraries(ssim=False)
+    metrics.ensure_packages(ssim=False)
     files.try_file(output)
     from nma.adapter import Adapter
     from nma.render import demo as demonstration

@@ -85,7 +85,7 @@ def flip_map(test: ArrayLike, reference: ArrayLike, *, hdr: bool = False, exposu
         hdr: HDR-FLIP, the worst over a range of exposures that the reference sets; otherwise LDR-FLIP.
         exposure: stops, for LDR-FLIP only.
     """
-    flip_evaluator = _library("flip_evaluator")
+    flip_evaluator = _package("flip_evaluator")
     a, b = _pair(test, reference)
     if hdr:
         a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
@@ -134,14 +134,14 @@ def _pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
     return a, b
 
 
-def ensure_libraries(ssim: bool = True) -> None:
+def ensure_packages(ssim: bool = True) -> None:
     """Raises `MissingDependencyError` unless all that metrics need is there: better before an hour of rendering."""
     for name in ("flip_evaluator", *(["skimage.metrics"] if ssim else [])):
-        _library(name)
+        _package(name)
 
 
-def _library(name: str) -> Any:
-    """A library of the extra `compare`.
+def _package(name: str) -> Any:
+    """A package of the extra `compare`.
 
     Raises:
         MissingDependencyError: it is not installed.
@@ -157,12 +157,12 @@ def _library(name: str) -> Any:
 def _ssim(a: Image, b: Image) -> float:
     settings: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return float(
-        _library("skimage.metrics").structural_similarity(a, b, channel_axis=-1, data_range=1.0, **settings)
+        _package("skimage.metrics").structural_similarity(a, b, channel_axis=-1, data_range=1.0, **settings)
     )
 
 
 def _exposures(reference: Image) -> dict[str, float]:
-    """Nothing for ordinary references. For black or flat ones, where the library ends the process, one exposure."""
+    """Nothing for ordinary references. For black or flat ones, which end the process in FLIP, one exposure."""
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
     brightest, middle = float(luminance.max()), float(np.median(luminance))
     if brightest > 1e-4 and brightest > 1.001 * middle:

@@ -98,7 +98,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
     return folder
 
 
-def library() -> Path:
+def shared_library() -> Path:
     """The path of the shared library of the C interface, which is compiled if it does not exist.
 
     Raises the errors of `build_mitsuba`.

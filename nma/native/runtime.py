@@ -37,7 +37,7 @@ _MESSAGE = 500
 
 def available() -> tuple[str, ...]:
     """The names of the instruction sets that this CPU has."""
-    return tuple(name for k, name in enumerate(INSTRUCTION_SETS[1:], 1) if _library().nma_supported(k))
+    return tuple(name for k, name in enumerate(INSTRUCTION_SETS[1:], 1) if _interface().nma_supported(k))
 
 
 class Runtime:
@@ -69,26 +69,26 @@ class Runtime:
             raise ParamError(
                 f"unknown instruction set {instruction_set!r}; known are {', '.join(INSTRUCTION_SETS)}"
             )
-        self._library = _library()
+        self._c = _interface()
         number = INSTRUCTION_SETS.index(instruction_set) + (_COMPACT if compact else 0)
         message = ctypes.create_string_buffer(_MESSAGE)
-        handle = self._library.nma_load(str(weights_file(adapter)).encode(), number, message, _MESSAGE)
+        handle = self._c.nma_load(str(weights_file(adapter)).encode(), number, message, _MESSAGE)
         if not handle:
             raise WeightsError(message.value.decode())
         self._handle = ctypes.c_void_p(handle)
         # The number of floats in a row that `prepare` returns.
-        self._brdf = self._library.nma_brdf_size() // np.dtype(np.float32).itemsize
-        self.parameters = self._library.nma_parameter_count(self._handle)
+        self._brdf = self._c.nma_brdf_size() // np.dtype(np.float32).itemsize
+        self.parameters = self._c.nma_parameter_count(self._handle)
         self.names = [self._name(k) for k in range(self.parameters)]
         self.low, self.high = self._ranges()
         self.material = self._single_material()
-        self.size = self._library.nma_output_count(self._handle)
-        self.anisotropic = bool(self._library.nma_anisotropic(self._handle))
-        self.instruction_set = INSTRUCTION_SETS[self._library.nma_instruction_set(self._handle)]
+        self.size = self._c.nma_output_count(self._handle)
+        self.anisotropic = bool(self._c.nma_anisotropic(self._handle))
+        self.instruction_set = INSTRUCTION_SETS[self._c.nma_instruction_set(self._handle)]
 
     def __del__(self) -> None:
         if handle := getattr(self, "_handle", None):
-            self._library.nma_free(handle)
+            self._c.nma_free(handle)
 
     def outputs(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
         """The raw outputs (n, size) of the network. Arguments and errors are those of `prepare`."""
@@ -139,18 +139,18 @@ class Runtime:
         return self._each("nma_albedo", brdfs, wi, 3)
 
     def _name(self, column: int) -> str:
-        return self._library.nma_parameter_name(self._handle, column).decode()
+        return self._c.nma_parameter_name(self._handle, column).decode()
 
     def _ranges(self) -> tuple[Array, Array]:
         """The lower and the upper end of each column's training range, each (parameters,)."""
         ends = np.empty((self.parameters, 2), np.float32)
         for column, pair in enumerate(ends):
-            self._library.nma_parameter_range(self._handle, column, _pointer(pair))
+            self._c.nma_parameter_range(self._handle, column, _pointer(pair))
         return ends[:, 0], ends[:, 1]
 
     def _single_material(self) -> Array | None:
         numbers = np.empty(self.parameters, np.float32)
-        return numbers if self._library.nma_single_material(self._handle, _pointer(numbers)) else None
+        return numbers if self._c.nma_single_material(self._handle, _pointer(numbers)) else None
 
     def _checked(self, params: ArrayLike, clamp: bool) -> Array:
         """`params` as float32 rows. Raises `ParamError` if they are outside the range, or not the single material's."""
@@ -179,7 +179,7 @@ class Runtime:
         if len(rows) != len(views):
             raise ParamError(f"params has {len(rows)} rows, but wi has {len(views)} {kind}")
         found = np.empty((len(rows), width), np.float32)
-        call = getattr(self._library, name + suffix)
+        call = getattr(self._c, name + suffix)
         call(self._handle, len(rows), *(_pointer(a) for a in (rows, views, found)))
         return found
 
@@ -200,7 +200,7 @@ class Runtime:
         if len({len(array) for array in arrays}) > 1:
             raise ParamError(f"arrays of different lengths: {', '.join(str(len(a)) for a in arrays)}")
         found = np.empty((len(arrays[0]), width), np.float32)
-        getattr(self._library, name)(len(found), *(_pointer(a) for a in (*arrays, found)))
+        getattr(self._c, name)(len(found), *(_pointer(a) for a in (*arrays, found)))
         return found
 
 
@@ -218,8 +218,8 @@ def _pointer(array: Array) -> Any:
 
 
 @cache
-def _library() -> ctypes.CDLL:
-    loaded = ctypes.CDLL(str(build.library()))
+def _interface() -> ctypes.CDLL:
+    loaded = ctypes.CDLL(str(build.shared_library()))
     loaded.nma_load.restype = ctypes.c_void_p
     loaded.nma_load.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t]
     loaded.nma_parameter_name.restype = ctypes.c_char_p

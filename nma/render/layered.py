@@ -20,7 +20,7 @@ from nma.render.bsdf import blended, define_base, mean_of_samples, over, vec3
 from nma.render.inputs import Inputs
 from nma.sources import layered_eval
 from nma.sources.base import walk
-from nma.sources.layered import Layered3, Layers
+from nma.sources.layered import Layered3, Stack
 
 # Walks behind the albedo of a point, with the same random numbers everywhere: no noise, but an error of about .03.
 ALBEDO_WALKS = 128
@@ -49,56 +49,56 @@ def define() -> type:
 
         def pdf(self, ctx, si, wo, active=True):
             with dr.suspend_grad():
-                layers, active = self._prepare(ctx, si, active)
-                return dr.select(active & (wo.z > 0), layered_eval.pdf(layers, vec3(si.wi), vec3(wo)), 0.0)
+                stack, active = self._prepare(ctx, si, active)
+                return dr.select(active & (wo.z > 0), layered_eval.pdf(stack, vec3(si.wi), vec3(wo)), 0.0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             with dr.suspend_grad():
-                layers, active = self._prepare(ctx, si, active)
-                return self._estimate(layers, si, wo, active)
+                stack, active = self._prepare(ctx, si, active)
+                return self._estimate(stack, si, wo, active)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             with dr.suspend_grad():
-                layers, active = self._prepare(ctx, si, active)
+                stack, active = self._prepare(ctx, si, active)
                 draw = self._draw if blended(self) else self._walk
-                wo, weight = draw(layers, si, (sample1, sample2.x, sample2.y), active)
-                pdf = layered_eval.pdf(layers, vec3(si.wi), vec3(wo))
+                wo, weight = draw(stack, si, (sample1, sample2.x, sample2.y), active)
+                pdf = layered_eval.pdf(stack, vec3(si.wi), vec3(wo))
                 return self._sampled(vec3(wo), pdf, vec3(weight), active & dr.any(weight > 0))
 
-        def _prepare(self, ctx, si, active) -> tuple[Layers, Any]:
-            """The layers at `si`, and the lanes that see their front."""
+        def _prepare(self, ctx, si, active) -> tuple[Stack, Any]:
+            """The stack at `si`, and the lanes that see its front."""
             self.inputs.check()
             front = self._front(ctx, si, active)
-            return self._layers(si, front), front
+            return self._stack(si, front), front
 
-        def _layers(self, si, active) -> Layers:
+        def _stack(self, si, active) -> Stack:
             return layered_eval.settle(source.gather(self.inputs.columns(si, active)))
 
-        def _walk(self, layers, si, u, active):
+        def _walk(self, stack, si, u, active):
             """One walk's direction and throughput."""
-            wo, throughput = walk(source, layers, vec3(si.wi), _random(*u, *si.wi), active)
+            wo, throughput = walk(source, stack, vec3(si.wi), _random(*u, *si.wi), active)
             return mi.Vector3f(*wo), mi.Color3f(*throughput)
 
-        def _draw(self, layers, si, u, active):
+        def _draw(self, stack, si, u, active):
             """A direction of density `pdf`, and an estimate of the value there over it."""
-            wo = mi.Vector3f(*layered_eval.sample(layers, vec3(si.wi), *u))
-            value, pdf = self._estimate(layers, si, wo, active)
+            wo = mi.Vector3f(*layered_eval.sample(stack, vec3(si.wi), *u))
+            value, pdf = self._estimate(stack, si, wo, active)
             return wo, over(value, pdf)
 
-        def _estimate(self, layers, si, wo, active):
+        def _estimate(self, stack, si, wo, active):
             active = active & (wo.z > 0)
             wi, wo_local = vec3(si.wi), vec3(wo)
             rng = _random(*wo, *si.wi, *si.p, *si.uv)
-            value = layered_eval.evaluate(layers, wi, wo_local, rng, active)
-            pdf = layered_eval.pdf(layers, wi, wo_local)
+            value = layered_eval.evaluate(stack, wi, wo_local, rng, active)
+            pdf = layered_eval.pdf(stack, wi, wo_local)
             return mi.Color3f(*select(active, value, Color.of(0.0))), dr.select(active, pdf, 0.0)
 
         def _albedo(self, si, active) -> Color:
             with dr.suspend_grad():
-                layers, wi = self._layers(si, active), vec3(si.wi)
+                stack, wi = self._stack(si, active), vec3(si.wi)
 
                 def draw(k, *_):
-                    return walk(source, layers, wi, _random(mi.Float(k)), active)[1]
+                    return walk(source, stack, wi, _random(mi.Float(k)), active)[1]
 
                 return mean_of_samples(draw, ALBEDO_WALKS, active)
 

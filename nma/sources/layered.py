@@ -33,7 +33,7 @@ TRAPPED_SURVIVAL = 0.999
 
 
 @dataclass
-class Layers:
+class Stack:
     """The stack, one value per lane. The conductor's indices of refraction are relative to the index of the coat."""
 
     alpha_top: Float
@@ -50,13 +50,13 @@ class Layered3:
 
     space = LAYERED3
 
-    def gather(self, columns: list[Any]) -> Layers:
+    def gather(self, columns: list[Any]) -> Stack:
         """The stack from the 13 columns of the class's parameter vector."""
         alpha_top, alpha_bottom, eta_top, *rest = columns
         eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
         # The conductor's Fresnel term sees the index of the coat, not that of air.
         inv = 1.0 / eta_top
-        return Layers(
+        return Stack(
             alpha_top,
             alpha_bottom,
             eta_top,
@@ -66,7 +66,7 @@ class Layered3:
             sigma_t,
         )
 
-    def step(self, params: Layers, walk: Walk, rng: Random) -> Walk:
+    def step(self, params: Stack, walk: Walk, rng: Random) -> Walk:
         """One free flight and one event: scattering in the medium, or reflection or refraction at an interface."""
         u_flight, u_lobe = rng.next_float32(), rng.next_float32()
         u1, u2 = rng.next_float32(), rng.next_float32()

@@ -30,7 +30,7 @@ from nma.microfacet import (
 )
 from nma.ops import Color, Float, Mask, Vec3
 from nma.sources.base import Random, Walk, throughput
-from nma.sources.layered import Layered3, Layers
+from nma.sources.layered import Layered3, Stack
 
 # A coat whose index is closer to 1 than this bends light too little for single precision, so `settle` sets it to 1.
 INDEX_MATCHED = 1e-3
@@ -39,62 +39,62 @@ _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
 LEAST_DIFFUSE = 0.03
 
 
-def settle(layers: Layers) -> Layers:
+def settle(stack: Stack) -> Stack:
     """The stack in the form that `evaluate` and `pdf` need: an almost index-matched coat gets the index 1 exactly."""
-    return replace(layers, eta_top=dr.select(layers.eta_top < 1.0 + INDEX_MATCHED, 1.0, layers.eta_top))
+    return replace(stack, eta_top=dr.select(stack.eta_top < 1.0 + INDEX_MATCHED, 1.0, stack.eta_top))
 
 
-def evaluate(layers: Layers, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True) -> Color:
+def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True) -> Color:
     """One unbiased estimate per lane of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
 
-    `layers` must come from `settle`. The expected integral over a set of wo equals the expected throughput that
+    `stack` must come from `settle`. The expected integral over a set of wo equals the expected throughput that
     `nma.sources.base.walk` carries through the set.
     """
-    there, back = _enter(layers, wi, rng), _enter(layers, wo, rng)
+    there, back = _enter(stack, wi, rng), _enter(stack, wo, rng)
     there.alive = back.alive = there.alive & back.alive & active
-    forward, _ = _unscattered(layers, wi, there, wo, back, rng, True)
-    backward, detour = _unscattered(layers, wo, back, wi, there, rng, False)
-    scattered = _scattered(layers, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
+    forward, _ = _unscattered(stack, wi, there, wo, back, rng, True)
+    backward, detour = _unscattered(stack, wo, back, wi, there, rng, False)
+    scattered = _scattered(stack, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
     # Walks from wo estimate f cos(theta_i), which reciprocity turns into f cos(theta_o). Scattered light connects below
     # the coat, where radiance is larger by the squared index, so it is divided by that.
-    index2 = layers.eta_top * layers.eta_top
+    index2 = stack.eta_top * stack.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
-    return forward + backward + coat_reflection(layers, wi, wo)
+    return forward + backward + coat_reflection(stack, wi, wo)
 
 
-def coat_reflection(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
+def coat_reflection(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
     """f cos(theta_o) [1/sr] of the reflection at the coat's upper side alone. Walter 2007, eq. 20."""
     m = ops.normalize(wi + wo)
-    fresnel, _ = fresnel_dielectric(ops.maximum(ops.dot(wi, m), 0.0), layers.eta_top)
-    alpha = layers.alpha_top
+    fresnel, _ = fresnel_dielectric(ops.maximum(ops.dot(wi, m), 0.0), stack.eta_top)
+    alpha = stack.alpha_top
     g = smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha)
     return fresnel * ggx_d(m, alpha, alpha) * g / (4.0 * ops.maximum(wi.z, 1e-7))
 
 
-def _enter(layers: Layers, w: Vec3, rng: Random) -> Walk:
+def _enter(stack: Stack, w: Vec3, rng: Random) -> Walk:
     """A walk that has come from `w` and is now just below the coat.
 
     The walk always refracts, because the light that the coat reflects has a closed form.
     """
-    alpha = layers.alpha_top
+    alpha = stack.alpha_top
     view = _above(w)
     m = sample_visible_normal(view, alpha, alpha, rng.next_float32(), rng.next_float32())
-    fresnel, cos_t = fresnel_dielectric(ops.maximum(ops.dot(view, m), 0.0), layers.eta_top)
-    down = refract(view, m, cos_t, layers.eta_top)
+    fresnel, cos_t = fresnel_dielectric(ops.maximum(ops.dot(view, m), 0.0), stack.eta_top)
+    down = refract(view, m, cos_t, stack.eta_top)
     weight = ops.select(down.z < 0, (1.0 - fresnel) * smith_g1(down, alpha, alpha), 0.0)
     one = w.x * 0.0 + 1.0
     return Walk(tuple(down), (weight, weight, weight), one, one > 0.5, weight > 0)
 
 
-def _crossing(layers: Layers, walk: Walk) -> Walk:
+def _crossing(stack: Stack, walk: Walk) -> Walk:
     """The walk after crossing the whole slab, its throughput multiplied by the slab's transmittance."""
-    dimmed = throughput(walk) * _transmittance(layers, 1.0, Vec3(*walk.direction))
+    dimmed = throughput(walk) * _transmittance(stack, 1.0, Vec3(*walk.direction))
     return replace(walk, throughput=tuple(dimmed))
 
 
-def _transmittance(layers: Layers, depth: Float, w: Vec3) -> Float:
+def _transmittance(stack: Stack, depth: Float, w: Vec3) -> Float:
     """Fraction of light along `w` that passes `depth` of the slab (1: the whole slab) without meeting the medium."""
-    return ops.exp(-layers.sigma_t * depth / ops.maximum(ops.absolute(w.z), 1e-7))
+    return ops.exp(-stack.sigma_t * depth / ops.maximum(ops.absolute(w.z), 1e-7))
 
 
 @dataclass
@@ -123,7 +123,7 @@ class _Detour:
 
 
 def _unscattered(
-    layers: Layers, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
+    stack: Stack, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
 ) -> tuple[Color, tuple[Vec3, Color]]:
     """Light from wi to wo that meets interfaces only, and one segment of the walk `there` after its first segment.
 
@@ -135,11 +135,11 @@ def _unscattered(
     possible connections. The balance heuristic (Veach 1997, eq. 9.8) combines the connections by the sharpness of their
     events.
     """
-    source, clear = Layered3(), replace(layers, sigma_t=layers.sigma_t * 0.0)
+    source, clear = Layered3(), replace(stack, sigma_t=stack.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
-    drawn_out = _out_through_coat(layers, wo, drawn_up)
-    way_in = _bluntness(_out_through_coat(layers, wi, -Vec3(*there.direction))[0])
-    matched = layers.eta_top == 1.0
+    drawn_out = _out_through_coat(stack, wo, drawn_up)
+    way_in = _bluntness(_out_through_coat(stack, wi, -Vec3(*there.direction))[0])
+    matched = stack.eta_top == 1.0
 
     def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
         """Light that a visit to the conductor sends to wo, and the bluntness of the walk's first visit.
@@ -150,25 +150,23 @@ def _unscattered(
         rest = way_in + first
         # Connect at the last visit. This is the only connection under an index-matched coat, which turns no light back.
         q, t = drawn_out
-        blunt = _bluntness(_sharpness(layers, w_in, drawn_up))
+        blunt = _bluntness(_sharpness(stack, w_in, drawn_up))
         share = ops.select(matched, 1.0, blunt / (blunt + rest + _bluntness(q)))
         if not forward:
             share = ops.select(first > 0, share, 0.0)
         meets = (
-            _mirror_pdf(_above(w_in), drawn_up, layers.alpha_bottom)
-            * t
-            * _transmittance(layers, 1.0, drawn_up)
+            _mirror_pdf(_above(w_in), drawn_up, stack.alpha_bottom) * t * _transmittance(stack, 1.0, drawn_up)
         )
-        found = throughput(before) * _conductor_weight(layers, w_in, drawn_up) * (share * meets)
+        found = throughput(before) * _conductor_weight(stack, w_in, drawn_up) * (share * meets)
         # Connect at the way out.
-        q, t = _out_through_coat(layers, wo, went_up)
-        blunt = _bluntness(_sharpness(layers, w_in, went_up))
+        q, t = _out_through_coat(stack, wo, went_up)
+        blunt = _bluntness(_sharpness(stack, w_in, went_up))
         share = ops.select(matched, 0.0, _bluntness(q) / (_bluntness(q) + blunt + rest))
-        found = found + throughput(after) * (share * q * t * _transmittance(layers, 1.0, went_up))
+        found = found + throughput(after) * (share * q * t * _transmittance(stack, 1.0, went_up))
         return found, ops.select(first > 0, first, blunt)
 
     def body(walk: Walk, rng: Random, total: tuple, first: Float, detour: _Detour) -> tuple:
-        before = _crossing(layers, walk)
+        before = _crossing(stack, walk)
         after = source.step(clear, before, rng)
         found, blunt = visit(before, after, first)
         at_bottom = after.height < 1
@@ -181,7 +179,7 @@ def _unscattered(
     return Color(*total), detour.chosen()
 
 
-def _scattered(layers: Layers, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
+def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
     """Light that scatters in the medium. Every scattering vertex of the walk is connected to each of the `ways` out.
 
     A way out is the direction and the throughput of a segment of a walk from wo that met interfaces only. The medium
@@ -190,18 +188,18 @@ def _scattered(layers: Layers, there: Walk, ways: list[tuple[Vec3, Color]], rng:
     source = Layered3()
 
     def body(walk: Walk, rng: Random, total: tuple) -> tuple:
-        after = source.step(layers, walk, rng)
+        after = source.step(stack, walk, rng)
         out = Color.of(0.0)
         for d, reached in ways:
             # The light travels against the segment, from the vertex to the interface where the segment began.
             depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
-            out = out + reached * (_transmittance(layers, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
-        found = throughput(walk) * Color(*layers.albedo) * out * _ISOTROPIC_PHASE
+            out = out + reached * (_transmittance(stack, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
+        found = throughput(walk) * Color(*stack.albedo) * out * _ISOTROPIC_PHASE
         scatters = (after.height > 0) & (after.height < 1)
         return after, rng, tuple(Color(*total) + ops.select(scatters, found, Color.of(0.0)))
 
-    zero = layers.sigma_t * 0.0
-    there = replace(there, alive=there.alive & (layers.sigma_t > 0))
+    zero = stack.sigma_t * 0.0
+    there = replace(there, alive=there.alive & (stack.sigma_t > 0))
     state = (there, rng, (zero, zero, zero))
     _, _, total = dr.while_loop(state, lambda walk, *rest: walk.alive, body, label="scattered")
     return Color(*total)
@@ -211,27 +209,27 @@ def _bluntness(density: Float) -> Float:
     return 1.0 / ops.maximum(density, 1e-20)
 
 
-def _sharpness(layers: Layers, w_in: Vec3, up: Vec3) -> Float:
+def _sharpness(stack: Stack, w_in: Vec3, up: Vec3) -> Float:
     """Approximate density [1/sr] of the conductor's reflection from `w_in` to `up`. It is the same in reverse."""
-    return 0.25 * ggx_d(ops.normalize(w_in + up), layers.alpha_bottom, layers.alpha_bottom)
+    return 0.25 * ggx_d(ops.normalize(w_in + up), stack.alpha_bottom, stack.alpha_bottom)
 
 
-def _conductor_weight(layers: Layers, w_in: Vec3, up: Vec3) -> Color:
+def _conductor_weight(stack: Stack, w_in: Vec3, up: Vec3) -> Color:
     """Factor of a walk's throughput where the conductor reflects it from `w_in` into `up`."""
     view = _above(w_in)
     cos_m = ops.dot(view, ops.normalize(view + up))
-    tint = fresnel_conductor_rgb(cos_m, Color(*layers.eta_bottom), Color(*layers.k_bottom))
-    return tint * smith_g1(up, layers.alpha_bottom, layers.alpha_bottom)
+    tint = fresnel_conductor_rgb(cos_m, Color(*stack.eta_bottom), Color(*stack.k_bottom))
+    return tint * smith_g1(up, stack.alpha_bottom, stack.alpha_bottom)
 
 
-def _out_through_coat(layers: Layers, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
+def _out_through_coat(stack: Stack, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
     """Two densities of refraction at the coat, returned as (q, t).
 
     q [1/sr] is the density of `up` when wo is refracted down at a visible normal. t is the density of wo given `up`,
     divided by q; the microfacet distribution and the Jacobian cancel in t. Walter 2007, eq. 16 (half vector) and 17
     (Jacobian).
     """
-    alpha, eta = layers.alpha_top, layers.eta_top
+    alpha, eta = stack.alpha_top, stack.eta_top
     matched = eta == 1.0
     half = up * eta - wo
     length2 = ops.maximum(ops.dot(half, half), 1e-20)
@@ -256,7 +254,7 @@ def _above(w: Vec3) -> Vec3:
     return Vec3(w.x, w.y, ops.maximum(w.z, 1e-7))
 
 
-def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
+def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     """Weights of the three lobes of `pdf`, which sum to 1, and the width of the second lobe.
 
     The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The
@@ -264,46 +262,46 @@ def lobes(layers: Layers, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     shifts the tangential part of a direction by 2 cos_t times the facet's slope. A facet of the coat shifts it by (eta
     cos_t - cos_i) / eta times the facet's slope, and light crosses the coat twice.
     """
-    eta, cos_i = layers.eta_top, ops.maximum(wi.z, 1e-3)
+    eta, cos_i = stack.eta_top, ops.maximum(wi.z, 1e-3)
     fresnel, cos_t = fresnel_dielectric(cos_i, eta)
-    crossing = layers.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
-    width2 = layers.alpha_bottom * layers.alpha_bottom + 2.0 * crossing * crossing
+    crossing = stack.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
+    width2 = stack.alpha_bottom * stack.alpha_bottom + 2.0 * crossing * crossing
     # The coat reflects the part of the conductor's lobe beyond the critical angle back down. That light may later leave
     # in any direction.
     critical = 1.0 / (eta + ops.safe_sqrt(eta * eta - 1.0))
     trapped = width2 / (width2 + critical * critical)
-    metal = _mean(fresnel_conductor_rgb(cos_t, Color(*layers.eta_bottom), Color(*layers.k_bottom)))
-    passes = (1.0 - fresnel) * ops.exp(-2.0 * layers.sigma_t / cos_t)
+    metal = _mean(fresnel_conductor_rgb(cos_t, Color(*stack.eta_bottom), Color(*stack.k_bottom)))
+    passes = (1.0 - fresnel) * ops.exp(-2.0 * stack.sigma_t / cos_t)
     bottom = passes * metal
-    medium = (1.0 - fresnel - passes) * _mean(Color(*layers.albedo))
+    medium = (1.0 - fresnel - passes) * _mean(Color(*stack.albedo))
     diffuse = LEAST_DIFFUSE + 0.5 * (medium + bottom * trapped)
     norm = 1.0 / (fresnel + bottom + diffuse)
     width = ops.sqrt(width2)
     return (fresnel * norm, bottom * norm, diffuse * norm), ops.clip(width, 1e-4, 1.0)
 
 
-def pdf(layers: Layers, wi: Vec3, wo: Vec3) -> Float:
+def pdf(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
     """A density of wo [1/sr] similar to that of the walk, for importance sampling and for weighing estimators.
 
     It is positive for wo.z > 0, and its integral is at most 1.
     """
-    (coat, bottom, diffuse), width = lobes(layers, wi)
-    inside_i, inside_o = refract_flat(wi, layers.eta_top), refract_flat(wo, layers.eta_top)
-    jacobian = wo.z / (layers.eta_top * layers.eta_top * inside_o.z)
-    mirrored = coat * _mirror_pdf(_above(wi), wo, layers.alpha_top)
+    (coat, bottom, diffuse), width = lobes(stack, wi)
+    inside_i, inside_o = refract_flat(wi, stack.eta_top), refract_flat(wo, stack.eta_top)
+    jacobian = wo.z / (stack.eta_top * stack.eta_top * inside_o.z)
+    mirrored = coat * _mirror_pdf(_above(wi), wo, stack.alpha_top)
     seen = bottom * _mirror_pdf(inside_i, inside_o, width) * jacobian
     return ops.select(wo.z > 0, mirrored + seen + diffuse * ops.INV_PI * wo.z, 0.0)
 
 
-def sample(layers: Layers, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
+def sample(stack: Stack, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
     """Draws a direction with density `pdf` from three numbers uniform in [0, 1).
 
     A direction that does not point up is an invalid sample.
     """
-    (coat, bottom, _), width = lobes(layers, wi)
-    on_coat, eta = u_lobe < coat, layers.eta_top
+    (coat, bottom, _), width = lobes(stack, wi)
+    on_coat, eta = u_lobe < coat, stack.eta_top
     view = ops.select(on_coat, _above(wi), refract_flat(wi, eta))
-    alpha = ops.select(on_coat, layers.alpha_top, width)
+    alpha = ops.select(on_coat, stack.alpha_top, width)
     mirrored = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
     # Light from the conductor leaves through a flat coat. Total internal reflection keeps oblique light inside.
     cos2 = 1.0 - eta * eta * (1.0 - mirrored.z * mirrored.z)

@@ -1,4 +1,4 @@
-"""The analytic BRDF that adapters drive: a blend of Principled BRDFs, written once for every array library."""
+"""The analytic BRDF that adapters drive: a blend of Principled BRDFs, written once for Dr.Jit, JAX and NumPy."""
 
 from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.brdf import Brdf
