@@ -53,7 +53,7 @@ def test_means_are_geometric_and_skip_unknown_ratios():
     assert frames.mean_doubt(rows, "nma", "layered") == pytest.approx(math.sqrt(2.0) * 0.05 / 2.0)
 
 
-def test_the_verdict_leaves_a_tenth_open():
+def test_efficiencies_within_a_tenth_count_as_even():
     told = [frames.verdict(gain) for gain in (None, 0.5, 0.95, 1.09, 1.2)]
     assert told == ["-", "simulation", "even", "even", "adapter"]
 

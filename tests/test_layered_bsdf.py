@@ -94,7 +94,7 @@ def test_evaluation_and_sampling_have_the_same_albedo():
         assert np.abs(z).max() < 4.0  # false alarm 4e-4
 
 
-def test_back_and_other_lobes_are_dark():
+def test_the_back_and_other_lobe_types_are_black():
     bsdf, ctx = mi.load_dict(LACQUER), mi.BSDFContext()
     si, rng = interactions(100, 0, 0.5)
     wo = mi.Vector3f(0.0, 0.6, 0.8)
@@ -168,7 +168,7 @@ def test_inputs_may_be_numbers_colours_spectra_or_textures():
     assert bsdf.inputs.columns(si)[1].numpy()[0] == pytest.approx(0.05)
 
 
-def test_xml_and_named_materials():
+def test_the_bsdf_loads_from_xml_and_from_named_materials():
     scene = mi.load_string(
         f"""<scene version="3.0.0"><shape type="sphere"><bsdf type="layered">
             <string name="material" value="{names()[0]}"/>

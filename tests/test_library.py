@@ -177,7 +177,7 @@ def test_the_runtime_in_cpp_reads_a_library(compiler, library, saved):
     np.testing.assert_allclose(runtime.outputs(codes, mu), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_mistakes_are_named(library, saved, tmp_path):
+def test_errors_name_the_mistake(library, saved, tmp_path):
     for call, words in (
         (lambda: library.code("rde"), "no material 'rde'.*did you mean 'red'"),
         (lambda: library.mix(["red", "blue"], [1]), "2 materials want as many weights"),

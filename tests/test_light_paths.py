@@ -52,7 +52,7 @@ def interaction(wi):
 
 
 @pytest.mark.parametrize("material", [MATERIAL, TEXTURED, STRETCHED, CONSTANT])
-def test_values_from_the_light_are_those_from_the_camera(folder, material, monkeypatch):
+def test_light_paths_have_the_values_of_camera_paths(folder, material, monkeypatch):
     """With the roles of `wi` and `wo` swapped, light paths evaluate the same f(view, light) as camera paths do.
 
     Samples of light paths have the pdf and the value that `eval_pdf` returns. A failure means that light tracing and

@@ -230,7 +230,7 @@ def test_a_value_beyond_a_bound_is_refused_with_name_row_and_range(bounds, name,
     np.testing.assert_array_equal(clamped, vectors)
 
 
-def test_rounding_beyond_a_bound_is_forgiven():
+def test_rounding_beyond_a_bound_is_allowed():
     """The ends of the range are accepted after rounding to single precision, and stay within the range."""
     ends = np.stack(LAYERED3.columns("training"))
     rounded = ends.astype(np.float32)

@@ -1,4 +1,4 @@
-"""An adapter of one material records its parameters. Users may leave them out, and other parameters are refused."""
+"""An adapter of one material records the parameters. Users may leave parameters out, and others are refused."""
 
 import json
 import math

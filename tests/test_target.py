@@ -136,7 +136,7 @@ def test_clearcoat_distribution_is_normalised(gloss):
 
 
 @pytest.mark.parametrize("n_instances", (1, 2, 5))
-def test_reciprocity(n_instances):
+def test_blends_are_reciprocal(n_instances):
     rng = np.random.default_rng(12)
     blend = random_blend(rng, 5000, n_instances)
     wi, wo = random_directions(rng, 5000), random_directions(rng, 5000)

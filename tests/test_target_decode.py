@@ -71,7 +71,7 @@ def test_the_blend_weight_is_that_of_the_first_instance():
     assert decode([0.0] * 22 + [-30.0], 2).weights[1] == pytest.approx(1.0)
 
 
-def test_roughness_reaches_the_floor_of_alpha():
+def test_roughness_reaches_the_lower_bound_of_alpha():
     sharp = decode([-40.0] * 23, 2)
     assert lobe_alphas(sharp)[0] == pytest.approx((0.001, 0.001, 0.1))
     wide = decode([40.0] * 23, 2)

@@ -12,7 +12,7 @@ def directions(n, seed):
     return Vec3(*(v / np.linalg.norm(v, axis=0)))
 
 
-def test_wi_enters_at_azimuth_zero():
+def test_enter_turns_wi_to_azimuth_zero():
     wi = directions(1000, 0)
     entered = Plane.of(wi).enter(wi)
     np.testing.assert_allclose(entered.y, 0.0, atol=1e-15)
@@ -20,7 +20,7 @@ def test_wi_enters_at_azimuth_zero():
     np.testing.assert_array_equal(entered.z, wi.z)
 
 
-def test_angles_stay_and_leaving_undoes_entering():
+def test_enter_keeps_angles_and_leave_is_its_inverse():
     wi, wo = directions(1000, 1), directions(1000, 2)
     plane = Plane.of(wi)
     np.testing.assert_allclose(dot(plane.enter(wi), plane.enter(wo)), dot(wi, wo), atol=1e-14)

@@ -119,7 +119,7 @@ def test_a_time_budget_ends_a_run(tables):
 
 
 @pytest.mark.slow
-def test_a_fit_approaches_what_it_fits():
+def test_a_fit_approaches_its_table():
     """A fit reaches a log loss below .003 in 300 steps if the network can represent the target of the table exactly."""
     params = LAYERED3.sample(np.random.default_rng(0), 1)
     truth = tabulate_adapter(constant_adapter(BRASS), params)

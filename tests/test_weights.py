@@ -60,7 +60,7 @@ def test_an_adapter_is_the_same_after_saving_and_loading(tmp_path, name, variant
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.safetensors"]
 
 
-def test_stretched_targets_follow_the_direction(tmp_path):
+def test_stretched_targets_must_depend_on_the_direction(tmp_path):
     """A file with a stretched target that does not depend on the direction is refused.
 
     Stretching lies in the plane of incidence, which the direction determines.
