@@ -1,5 +1,8 @@
 """A second class of materials needs its parameters, a source and one line in each registry. No other code changes."""
 
+import sys
+import types
+
 import numpy as np
 import pytest
 
@@ -37,7 +40,10 @@ class Bare(Layered3):
 def bare(monkeypatch, tmp_path):
     """The path of a material file of the class `bare`, which this fixture adds to the registries."""
     monkeypatch.setitem(SPACES, "bare", BARE)
-    monkeypatch.setitem(sources._FACTORIES, "bare", Bare)
+    module = types.ModuleType("nma.sources.bare")
+    module.Bare = Bare
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(sources.CLASSES, "bare", "bare:Bare")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "steel.toml").write_text(MATERIAL)
     return tmp_path / "steel.toml"
