@@ -5,10 +5,45 @@
 
 namespace {
 
-using nma::layered::Vec;
+namespace layered = nma::layered;
+using layered::Vec;
+
+constexpr Vec NOTHING{0.0f, 0.0f, 0.0f};
 
 Vec vec(const float* v) { return {v[0], v[1], v[2]}; }
 void put(const Vec& v, float* to) { std::copy_n(&v.x, 3, to); }
+
+// Sums of weights and of their squares over the bins of a table, as nma/table lays them out: [row, o, p, rgb].
+struct Bins {
+    int o, p;
+    double *sums, *squares;
+
+    void add(int row, const Vec& wo, const Vec& weight) const {
+        const float turn = nma::absolute(std::atan2(wo.y, wo.x)) * nma::INV_PI<float>;
+        const int column = row * o + std::min(static_cast<int>(wo.z * static_cast<float>(o)), o - 1);
+        const int bin = 3 * (column * p + std::min(static_cast<int>(turn * static_cast<float>(p)), p - 1));
+        const double channels[] = {weight.x, weight.y, weight.z};
+        for (int c = 0; c < 3; ++c) {
+            sums[bin + c] += channels[c];
+            squares[bin + c] += channels[c] * channels[c];
+        }
+    }
+};
+
+// A direction of the row, at azimuth 0.
+Vec view(int row, int rows, layered::Random& random) {
+    const float z = (static_cast<float>(row) + random.uniform()) / static_cast<float>(rows);
+    return {nma::safe_sqrt(1.0f - z * z), 0.0f, z};
+}
+
+// A direction that follows the density, and the estimate there over it.
+layered::Walk estimate(const layered::Layers& layers, const Vec& wi, layered::Random& random) {
+    const layered::Density density(layers, wi);
+    const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
+    const auto drawn = layered::sample(layers, density, wi, u_lobe, u1, u2);
+    if (!(drawn.pdf > 0.0f)) return {drawn.wo, NOTHING, 1.0f, false, false};
+    return {drawn.wo, layered::evaluate(layers, wi, drawn.wo, random) * (1.0f / drawn.pdf), 1.0f, false, false};
+}
 
 }  // namespace
 
@@ -16,33 +51,54 @@ extern "C" {
 
 // All for one material, seen from one direction; rows of `wo`.
 void layered_pdf(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
-    const auto layers = nma::layered::Layers::of(parameters);
-    const nma::layered::Density density(layers, vec(wi));
-    for (int i = 0; i < n; ++i) pdf[i] = nma::layered::pdf(layers, density, vec(wi), vec(wo + 3 * i));
+    const auto layers = layered::Layers::of(parameters);
+    const layered::Density density(layers, vec(wi));
+    for (int i = 0; i < n; ++i) pdf[i] = layered::pdf(layers, density, vec(wi), vec(wo + 3 * i));
+}
+
+// The same for a material and a view in each row.
+void layered_pdf_each(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
+    constexpr int COLUMNS = nma::layered3::COLUMNS;
+    for (int i = 0; i < n; ++i) layered_pdf(1, parameters + COLUMNS * i, wi + 3 * i, wo + 3 * i, pdf + i);
 }
 
 // Rows of three uniform numbers to rows of wo, its density, and an estimate of the value.
 void layered_sample(int n, const float* parameters, const float* wi, const float* u, float* out) {
-    const auto layers = nma::layered::Layers::of(parameters);
-    const nma::layered::Density density(layers, vec(wi));
-    nma::layered::Random random(1, 2);
+    const auto layers = layered::Layers::of(parameters);
+    const layered::Density density(layers, vec(wi));
+    layered::Random random(1, 2);
     for (int i = 0; i < n; ++i, u += 3, out += 7) {
-        const auto drawn = nma::layered::sample(layers, density, vec(wi), u[0], u[1], u[2]);
+        const auto drawn = layered::sample(layers, density, vec(wi), u[0], u[1], u[2]);
         put(drawn.wo, out);
         out[3] = drawn.pdf;
-        put(drawn.pdf > 0.0f ? nma::layered::evaluate(layers, vec(wi), drawn.wo, random) : Vec{0.0f, 0.0f, 0.0f},
-            out + 4);
+        put(drawn.pdf > 0.0f ? layered::evaluate(layers, vec(wi), drawn.wo, random) : NOTHING, out + 4);
     }
 }
 
 // Rows of throughputs.
 void layered_walks(int n, const float* parameters, const float* wi, float* out) {
-    const auto layers = nma::layered::Layers::of(parameters);
-    nma::layered::Random random(3, 4);
-    for (int i = 0; i < n; ++i) put(nma::layered::walk(layers, vec(wi), random).throughput, out + 3 * i);
+    const auto layers = layered::Layers::of(parameters);
+    layered::Random random(3, 4);
+    for (int i = 0; i < n; ++i) put(layered::walk(layers, vec(wi), random).throughput, out + 3 * i);
+}
+
+// Tables from `per_row` walks, or estimates, from each row of views.
+void layered_table(bool walks, int rows, int o, int p, int per_row, int seed, const float* parameters, double* sums,
+                   double* squares) {
+    const auto layers = layered::Layers::of(parameters);
+    const Bins bins{o, p, sums, squares};
+    for (int row = 0; row < rows; ++row) {
+        layered::Random random(static_cast<std::uint64_t>(seed), static_cast<std::uint64_t>(row));
+        for (int k = 0; k < per_row; ++k) {
+            const Vec wi = view(row, rows, random);
+            const layered::Walk made = walks ? layered::walk(layers, wi, random) : estimate(layers, wi, random);
+            if (made.throughput.x > 0.0f || made.throughput.y > 0.0f || made.throughput.z > 0.0f)
+                bins.add(row, made.direction, made.throughput);
+        }
+    }
 }
 
 void layered_albedo(const float* parameters, const float* wi, float* out) {
-    put(nma::layered::albedo(nma::layered::Layers::of(parameters), vec(wi)), out);
+    put(layered::albedo(layered::Layers::of(parameters), vec(wi)), out);
 }
 }

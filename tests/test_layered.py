@@ -1,11 +1,8 @@
-"""The layered source: its evaluation, compared with its own random walks, and its sampling density.
-
-A statistical test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's correction.
-"""
+"""The layered source: its evaluation, compared with its own random walks, and its sampling density."""
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from layered_cases import CASES, GRID, limit, table_of, vector, z_scores
 
 from nma import ops
 from nma.jit import dr
@@ -14,42 +11,9 @@ from nma.params import LAYERED3
 from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3
-from nma.table import Grid, stream_keys, tabulate
+from nma.table import stream_keys, tabulate
 
 Float, PCG32 = dr.auto.Float, dr.auto.PCG32
-FALSE_ALARM = 1e-3
-GRID = Grid(theta_i=5, theta_o=10, phi_o=10)
-WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
-
-# Narrow and wide lobes of coat and conductor, thin and thick media, and coats that refract light much, little or not.
-CASES = {
-    "white_coated": {"alpha_top": 0.2, "alpha_bottom": 0.4, "eta_top": 1.5, "sigma_t": 0.0, **WHITE},
-    "white_with_medium": {
-        "alpha_top": 0.2,
-        "alpha_bottom": 0.4,
-        "eta_top": 1.5,
-        "sigma_t": 1.0,
-        "albedo": 0.9,
-        **WHITE,
-    },
-    "narrow_narrow": {"alpha_top": 1e-3, "alpha_bottom": 2e-3, "eta_top": 1.5, "sigma_t": 0.3, "albedo": 0.8},
-    "narrow_wide": {"alpha_top": 1e-3, "alpha_bottom": 0.5, "eta_top": 1.7, "sigma_t": 0.3},
-    "wide_narrow": {"alpha_top": 0.3, "alpha_bottom": 1e-3, "eta_top": 1.5, "sigma_t": 0.0},
-    "wide_narrow_weak": {"alpha_top": 0.3, "alpha_bottom": 2e-3, "eta_top": 1.05, "sigma_t": 0.5},
-    "thick": {
-        "alpha_top": 0.1,
-        "alpha_bottom": 1.0,
-        "eta_top": 2.0,
-        "sigma_t": 4.0,
-        "albedo": (0.3, 0.9, 1.0),
-    },
-    "index_matched": {"alpha_top": 1e-4, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 1.0, "albedo": 0.7},
-}
-COPPER = {"eta_conductor": (0.24, 0.96, 1.18), "k_conductor": (3.9, 2.6, 2.4)}
-
-
-def vector(values):
-    return LAYERED3.vector({"albedo": (0.9, 0.5, 0.1), **COPPER, **values})
 
 
 def layers_of(values, n):
@@ -85,11 +49,6 @@ def estimates(layers, wi, rng):
     return wo, np.array([c.numpy() for c in weight], np.float64)
 
 
-def limit(comparisons):
-    """The |z| above which one of this many two-sided Z-tests rejects."""
-    return norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / comparisons)))
-
-
 def evaluated_table(values, per_row, seed):
     """The bin means (theta_i, theta_o, phi, 3) from evaluation, and their standard errors."""
     row = dr.arange(dr.auto.UInt32, GRID.theta_i * per_row) // per_row
@@ -102,12 +61,11 @@ def evaluated_table(values, per_row, seed):
         np.abs(np.arctan2(wo.y.numpy(), wo.x.numpy())) / np.pi * GRID.phi_o, GRID.phi_o - 1
     ).astype(int)
     index = (row.numpy() * GRID.theta_o + o) * GRID.phi_o + p
-    scale = 1.0 / (per_row * GRID.solid_angle)
     sums, squares = (
         np.stack([np.bincount(index, w, GRID.bins) for w in weight**power], axis=-1).reshape(GRID.shape)
         for power in (1, 2)
     )
-    return sums * scale, np.sqrt(squares - sums**2 / per_row) * scale
+    return table_of(sums, squares, per_row)
 
 
 def compare(values, seed, factor=1.0):
@@ -116,12 +74,7 @@ def compare(values, seed, factor=1.0):
     There is one for each bin with over 100 walks, and one for the sum of each row.
     """
     walks = tabulate(Layered3(), vector(values)[None], 1 << 20, stream_keys(seed, range(1)), grid=GRID)
-    found, error = evaluated_table(values, 1 << 17, seed)
-    enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
-    difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2
-    # A walk ends in one bin only, so bins are negatively correlated: this sum is an upper bound of the variance.
-    rows = difference.sum(axis=(1, 2)) / np.sqrt(variance.sum(axis=(1, 2)))
-    return np.concatenate([difference[enough] / np.sqrt(variance[enough]), rows.ravel()])
+    return z_scores(*evaluated_table(values, 1 << 17, seed), walks, factor)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,0 +1,66 @@
+"""Hard cases of the layered material, and Z-tests of tables, which tests in Python and in C++ share.
+
+A statistical test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's correction.
+"""
+
+import numpy as np
+from scipy.stats import norm
+
+from nma.params import LAYERED3
+from nma.table import Grid
+
+FALSE_ALARM = 1e-3
+GRID = Grid(theta_i=5, theta_o=10, phi_o=10)
+WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
+COPPER = {"eta_conductor": (0.24, 0.96, 1.18), "k_conductor": (3.9, 2.6, 2.4)}
+
+# Narrow and wide lobes of coat and conductor, thin and thick media, and coats that refract light much, little or not.
+CASES = {
+    "white_coated": {"alpha_top": 0.2, "alpha_bottom": 0.4, "eta_top": 1.5, "sigma_t": 0.0, **WHITE},
+    "white_with_medium": {
+        "alpha_top": 0.2,
+        "alpha_bottom": 0.4,
+        "eta_top": 1.5,
+        "sigma_t": 1.0,
+        "albedo": 0.9,
+        **WHITE,
+    },
+    "narrow_narrow": {"alpha_top": 1e-3, "alpha_bottom": 2e-3, "eta_top": 1.5, "sigma_t": 0.3, "albedo": 0.8},
+    "narrow_wide": {"alpha_top": 1e-3, "alpha_bottom": 0.5, "eta_top": 1.7, "sigma_t": 0.3},
+    "wide_narrow": {"alpha_top": 0.3, "alpha_bottom": 1e-3, "eta_top": 1.5, "sigma_t": 0.0},
+    "wide_narrow_weak": {"alpha_top": 0.3, "alpha_bottom": 2e-3, "eta_top": 1.05, "sigma_t": 0.5},
+    "thick": {
+        "alpha_top": 0.1,
+        "alpha_bottom": 1.0,
+        "eta_top": 2.0,
+        "sigma_t": 4.0,
+        "albedo": (0.3, 0.9, 1.0),
+    },
+    "index_matched": {"alpha_top": 1e-4, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 1.0, "albedo": 0.7},
+}
+
+
+def vector(values):
+    return LAYERED3.vector({"albedo": (0.9, 0.5, 0.1), **COPPER, **values})
+
+
+def limit(comparisons):
+    """The |z| above which one of this many two-sided Z-tests rejects."""
+    return norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / comparisons)))
+
+
+def table_of(sums, squares, per_row):
+    """The bin means (theta_i, theta_o, phi, 3) and their standard errors, from sums over `per_row` weights per row."""
+    scale = 1.0 / (per_row * GRID.solid_angle)
+    return sums * scale, np.sqrt(squares - sums**2 / per_row) * scale
+
+
+def z_scores(found, error, walks, factor=1.0, known=np.inf):
+    """The z-scores of `found` (times `factor`) minus walks, for sums of rows and for the bins with over 100 walks whose
+    relative error is below `known`."""
+    enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
+    enough &= error < known * found
+    difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2
+    # A walk ends in one bin only, so bins are negatively correlated: this sum is an upper bound of the variance.
+    rows = difference.sum(axis=(1, 2)) / np.sqrt(variance.sum(axis=(1, 2)))
+    return np.concatenate([difference[enough] / np.sqrt(variance[enough]), rows.ravel()])
