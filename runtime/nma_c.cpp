@@ -12,7 +12,8 @@ struct nma_curves {
     nma::Curves curves;
 };
 
-static_assert(sizeof(nma::Brdf) <= sizeof(nma_brdf) && alignof(nma::Brdf) <= alignof(nma_brdf));
+static_assert(sizeof(nma::Brdf) <= sizeof(nma_brdf) && alignof(nma::Brdf) <= alignof(nma_brdf),
+              "a BRDF has outgrown nma_brdf: raise its number of floats in nma_c.h");
 static_assert(std::is_trivially_copyable_v<nma::Brdf>);
 
 namespace {

@@ -65,6 +65,7 @@ void brdf_numbers(int n, int count, const nma_brdf* brdfs, float* out) {
     }
 }
 
+int brdf_size() { return sizeof(nma::Brdf); }
 int curve_nodes() { return nma::Curves::NODES; }
 float curve_min_cos() { return nma::Curves::MIN_COS; }
 }

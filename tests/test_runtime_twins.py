@@ -126,6 +126,11 @@ def test_curves_have_the_same_nodes(bridge):
     assert bridge.curve_min_cos() == np.float32(curves.MIN_COS)
 
 
+def test_a_brdf_has_the_size_that_the_readme_says(bridge):
+    readme = (ROOT / "runtime/README.md").read_text()
+    assert bridge.brdf_size() == int(re.search(r"a plain value of (\d+) bytes", readme)[1])
+
+
 def test_instruction_sets_have_the_numbers_of_the_c_header():
     header = (ROOT / "runtime/nma_c.h").read_text()
     names = re.search(r"enum \{ (.*) \};", header)[1].split(", ")
