@@ -81,7 +81,7 @@ def test_a_flat_mesh_lies_above_the_floor(tmp_path):
         (PLY.format(3, 1, "1 2 3\n1 2 3\n1 2 3\n3 0 1 2"), "no extent"),
         (
             PLY.format(3, 2, "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 1 99"),
-            "triangle 1 has the vertex 99, but there are 3",
+            "triangle 1 refers to vertex 99, but the mesh has 3 vertices",
         ),
     ],
 )

@@ -1,11 +1,12 @@
-"""Rendering in Mitsuba 3. Importing this package makes its BSDFs `nma` and `layered` known there:
+"""Rendering in Mitsuba 3. Importing this package registers its BSDF plugins `nma` and `layered`:
 
     import mitsuba as mi
     import nma.render
 
     mi.set_variant("llvm_ad_rgb")
 
-They exist in the variant in use and in every one chosen later, so the order of these lines does not matter.
+The plugins are registered in the variant in use and in every variant chosen later, so these lines may stand in any
+order.
 """
 
 from __future__ import annotations
@@ -19,23 +20,24 @@ from nma.render import register as _plugins
 
 __all__ = ["use"]
 
-# Mitsuba loads Dr.Jit, which then wants its libLLVM chosen. Where there is none, scalar_rgb and GPUs remain.
+# Mitsuba loads Dr.Jit, and Dr.Jit then looks for libLLVM, so choose libLLVM first. Without libLLVM, scalar_rgb and the
+# CUDA variants still work.
 with contextlib.suppress(MissingDependencyError):
     ensure_llvm()
 _plugins.register()
 
 
 def use(variant: str = "auto") -> str:
-    """Choose Mitsuba's variant, and return its name.
+    """Choose Mitsuba's variant and return its name.
 
     Args:
         variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb. The
-            plugins for scalar_rgb are compiled when it is first chosen. Our BSDFs run in these three.
+            plugins for scalar_rgb are compiled when scalar_rgb is first chosen. Our BSDFs run in these three variants.
 
     Raises:
         ParamError: Mitsuba has no such variant.
-        MissingDependencyError: the variant needs libLLVM, and it is missing or too old; or a C++ compiler, or an
-            NVIDIA GPU.
+        MissingDependencyError: the variant needs libLLVM, a C++ compiler or an NVIDIA GPU, and this machine has none,
+            or its libLLVM is too old.
     """
     import drjit as dr
     import mitsuba as mi
@@ -46,7 +48,7 @@ def use(variant: str = "auto") -> str:
         raise ParamError(f"Mitsuba has no variant {variant!r}; it has {', '.join(mi.variants())}")
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise MissingDependencyError(
-            f"{variant} needs an NVIDIA GPU and its driver, `nma doctor` says what is missing; llvm_ad_rgb needs none"
+            f"{variant} needs an NVIDIA GPU and its driver; run `nma doctor` for what is missing, or take llvm_ad_rgb"
         )
     if variant.startswith("llvm"):
         ensure_llvm()

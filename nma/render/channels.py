@@ -1,4 +1,4 @@
-"""What the channels of a rendered picture are: colours, and what else an integrator of Mitsuba's puts beside them."""
+"""Names the channels of a rendered picture: colours, and the other channels that Mitsuba's integrators write."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nma.images.io import CHANNELS
 
-# IEC 61966-2-1, as `mitsuba.xyz_to_srgb` has it.
+# IEC 61966-2-1, with the digits of `mitsuba.xyz_to_srgb`.
 _XYZ_TO_SRGB = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]],
     np.float32,
@@ -18,10 +18,11 @@ _RGBA = [letter.upper() for letter in CHANNELS]
 
 
 def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
-    """The names of the `count` channels of a scene's picture, once it was rendered; all of them differ.
+    """The names of the `count` channels of a scene's rendered picture; all names differ. Render the scene first.
 
-    The film names its own colours first. Its list goes on with all that the integrator computes: `aov` announces its
-    nested integrators as RGBA, and then hands them over in the film's format, the first one in place of the film's.
+    The film lists its own colours first, then all channels of the integrator. The integrator `aov` announces each
+    nested integrator as RGBA, but writes it in the film's format, and the first nested integrator takes the place of
+    the film's colours.
     """
     announced = list(scene.integrator().aov_names())
     film = [channel.name for channel in scene.sensors()[sensor].film().bitmap().struct_()]
@@ -38,7 +39,11 @@ def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
 
 
 def colours(image: NDArray[np.float32], names: list[str]) -> NDArray[np.float32]:
-    """The picture's colours as linear sRGB (height, width, 3): its first three channels if they are such, else grey."""
+    """The colours of a picture, as linear sRGB (height, width, 3).
+
+    They come from the first three channels where `names` says that these are RGB or XYZ. Otherwise the first channel is
+    shown as grey.
+    """
     if names[:3] == _RGBA[:3]:
         return image[..., :3]
     if names[:3] == ["X", "Y", "Z"]:

@@ -1,4 +1,4 @@
-"""Against fireflies: an integrator that dims samples brighter than a limit."""
+"""Removes fireflies: an integrator that dims samples brighter than a limit."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from nma.errors import ParamError
 
 
 def clamped(integrator: Any, limit: float) -> Any:
-    """Another integrator around Mitsuba's `integrator`, to be passed to `mi.render`.
+    """An integrator that wraps Mitsuba's `integrator` and limits its samples; pass it to `mi.render`.
 
-    Samples of a pixel whose brightest channel exceeds `limit` [radiance] are scaled down to it and keep their colour.
-    What they carried beyond is lost, so pictures become darker: most where light arrives by chance, as caustics do.
+    A sample whose brightest channel exceeds `limit` [radiance] is scaled down to the limit and keeps its colour. The
+    light beyond the limit is lost, so pictures become darker, most of all in caustics and wherever few paths find the
+    light.
 
     Raises:
-        ParamError: an integrator that does not trace one path for each sample, or writes other channels than colour.
+        ParamError: the integrator does not trace one path for each sample, or it writes channels other than colour.
     """
     import mitsuba
 
@@ -22,10 +23,12 @@ def clamped(integrator: Any, limit: float) -> Any:
 
     mi: Any = mitsuba  # its types change with the variant
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
-        raise ParamError("samples can only be clamped where each is one path: use path, volpath or direct")
+        raise ParamError(
+            "samples can only be clamped if each is one path; use the integrator path, volpath or direct"
+        )
     if integrator.aov_names():
         others = ", ".join(integrator.aov_names())
-        raise ParamError(f"samples cannot be clamped beside other channels ({others}); render colours alone")
+        raise ParamError(f"samples cannot be clamped beside other channels ({others}); render colours only")
 
     class Clamped(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):

@@ -1,4 +1,4 @@
-"""The demonstration: reference, adapter and their difference, without and with textures, and what each costs."""
+"""The demonstration: reference, adapter and their difference, without and with textures, and the cost of each."""
 
 from __future__ import annotations
 
@@ -24,15 +24,19 @@ from nma.render.textures import bitmap_texture, procedural_textures
 HEADINGS = ("material", "BSDF", "time", "compile", "variance", "HDR-FLIP", "SMAPE", "efficiency")
 DEPTH = 6
 TEXTURE_SCALE = 2.0
-STAND_IN_RUNS = 2  # of `principled`, which is only timed
-FIRST_SPP = 16  # of the pictures that come before the figures
-# FLIP that takes the last colour of the difference picture.
+STAND_IN_RUNS = 2  # runs of `principled`, which is only timed
+FIRST_SPP = 16  # samples per pixel of the first pictures, which come before the measurements
+# The FLIP error that gets the last colour of the difference picture.
 FLIP_SCALE = 0.5
 Progress = Callable[[str, int], None]
 
 
 class Settings(NamedTuple):
-    """How large and how long: `spp` of each measured frame, `runs` frames a BSDF, `reference_spp` of the references."""
+    """Settings of the demonstration.
+
+    `size`: width and height of a picture. `spp`: samples per pixel of a measured frame. `runs`: frames per BSDF.
+    `reference_spp`: samples per pixel of the references. `adapter`: a weights file.
+    """
 
     size: tuple[int, int] = (256, 256)
     spp: int = 64
@@ -47,7 +51,7 @@ class Settings(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A material's name, its label in the sheet, and its BSDFs by their names."""
+    """The name of a material, its label in the sheet, and Mitsuba's dictionaries of its BSDFs by their names."""
 
     material: str
     label: str
@@ -55,14 +59,17 @@ class Scene(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A picture (height, width, 3), and the seconds that it took with all compilation."""
+    """A picture (height, width, 3), and the seconds that it took, compilation included."""
 
     image: NDArray[np.float64]
     seconds: float
 
 
 class Line(NamedTuple):
-    """One line of the table: a BSDF in one of the scenes. `errors` of its mean over the runs; empty for a stand-in."""
+    """One line of the table: a BSDF in one of the scenes.
+
+    `errors`: the errors of its mean over the runs; empty for `principled`.
+    """
 
     material: str
     bsdf: str
@@ -83,15 +90,15 @@ def demo(
     progress: Progress = lambda what, samples: None,
     published: Callable[[str], None] = lambda shown: None,
 ) -> list[Line]:
-    """Render the demonstration and write its sheet: at once with few samples, then anew with each scene's figures.
+    """Render the demonstration and write its sheet: first with few samples, then again after each scene is measured.
 
     Args:
-        path: the PNG; written atomically each time.
-        progress: called with what is being rendered, and the samples per pixel just done.
-        published: called with what the PNG shows, whenever that is more than before.
+        path: the PNG, written atomically each time.
+        progress: called with the name of what is being rendered, and the samples per pixel just done.
+        published: called after each writing with a description of what is new in the PNG.
 
     Returns:
-        The lines of the table, three for each scene: `principled`, `layered`, `nma`.
+        The lines of the table: `principled`, `layered` and `nma` for each scene.
     """
     rows: dict[str, Row] = {}
     lines: list[Line] = []
@@ -121,13 +128,13 @@ def demo(
 
 
 def total_samples(settings: Settings) -> int:
-    """Samples per pixel that `demo` reports to `progress` in total."""
+    """The samples per pixel that `demo` reports to `progress` in total."""
     frames = 2 * settings.runs + STAND_IN_RUNS
     return 2 * (3 * settings.first_spp + frames * settings.spp + settings.reference_spp)
 
 
 def note(settings: Settings) -> str:
-    """What the figures mean, and on what they were measured."""
+    """Text that says what the figures mean and on which machine they were measured."""
     import mitsuba as mi
 
     width, height = settings.size
@@ -136,14 +143,14 @@ def note(settings: Settings) -> str:
         f"Time and variance: one frame of {width} x {height} pixels, {settings.spp} spp, path depth {DEPTH};\n"
         f"median and variance of {settings.runs} seeds. Efficiency: 1 / (variance x time).\n"
         f"Errors: mean of these frames ({samples} spp) against a reference of {settings.reference_spp} spp; "
-        "`layered` has noise alone.\n"
-        f"`principled` is a stand-in for its time, textured alike. FLIP: black 0 to yellow {FLIP_SCALE:g}.\n"
+        "that of `layered` is only noise.\n"
+        f"`principled`, with equal textures, is there to compare times. FLIP: black 0 to yellow {FLIP_SCALE:g}.\n"
         f"Mitsuba {mi.__version__}, {mi.variant()}, {os.cpu_count()} CPU cores; adapter {Path(settings.adapter).stem}."
     )
 
 
 def _scenes(adapter: str) -> list[Scene]:
-    """Two materials, each as `principled` (a stand-in), `layered` and `nma`."""
+    """Two materials, each as `layered`, as `nma`, and as a roughly similar `principled` to compare times."""
     gold = materials.load("gold-red-lacquer")
     plain = {"type": "principled", "metallic": 1.0, "roughness": 0.35}
     plain["base_color"] = {"type": "rgb", "value": list(gold.values["albedo"])}  # type: ignore[arg-type]
@@ -181,7 +188,7 @@ def _load(bsdf: dict[str, Any], settings: Settings) -> Any:
 
 
 def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[str, Frame]:
-    """A frame of few samples by each BSDF: something to look at, and the time that compilation takes."""
+    """A frame of few samples for each BSDF: a first picture, and the time with compilation."""
     frames = {}
     for name, bsdf in scene.bsdfs.items():
         frames[name] = Frame(*render_seconds(_load(bsdf, settings), settings.first_spp, settings.runs))
@@ -192,7 +199,7 @@ def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[
 def _measured(
     scene: Scene, first: dict[str, Frame], settings: Settings, progress: Progress
 ) -> tuple[NDArray[np.float32], list[Line]]:
-    """The reference, from samples of its own, and a line for each BSDF."""
+    """The reference picture, rendered with a seed of its own, and the line of each BSDF."""
     truth = render_passes(
         _load(scene.bsdfs["layered"], settings),
         settings.reference_spp,
@@ -225,14 +232,14 @@ def _write(path: str | Path, rows: list[Row], lines: list[Line], settings: Setti
 
 
 def _early_row(scene: Scene, frames: dict[str, Frame], settings: Settings) -> Row:
-    """The pictures of one scene before anything is measured."""
+    """The row of a scene before anything is measured."""
     truth, adapter = (frames[name].image.astype(np.float32) for name in ("layered", "nma"))
     text = f"{settings.first_spp} spp, figures follow"
     return Row(scene.label, [truth, adapter, _difference(adapter, truth)], [text, text])
 
 
 def _row(label: str, truth: NDArray[np.float32], reference: Line, adapter: Line, settings: Settings) -> Row:
-    """The pictures of one scene, with time, variance and error under them."""
+    """The row of a scene, with time, variance and error under the pictures."""
     captions = [_caption(line, settings) for line in (reference, adapter)]
     captions.append(
         f"mean {adapter.errors['flip_ldr']:.4f}, of noise alone {reference.errors['flip_ldr']:.4f}"

@@ -1,7 +1,8 @@
-"""Light for the preview scene: a studio of softboxes, or sun, sky and a small lamp. Made by code alone, no assets.
+"""Light for the preview scene: a studio of softboxes, or sun, sky and a small lamp. Code makes all of it; there are no
+asset files.
 
-Each lighting is a dictionary of Mitsuba's emitters. A sky is an image, which Mitsuba samples by its brightness; lengths
-are in units of the shader ball's radius, z is up, directions point from the ball to the light.
+Each lighting is a dictionary of Mitsuba's emitters. The sky is an image, and Mitsuba samples its pixels by brightness.
+Lengths are in units of the shader ball's radius, and z is up. Directions point from the ball to the light.
 """
 
 from __future__ import annotations
@@ -22,16 +23,20 @@ Colour = tuple[float, float, float]
 LIGHTINGS = ("studio", "outdoors")
 
 SUN_DIRECTION = (-0.62, -0.50, 0.72)
-SUN_APERTURE = 4.0  # degrees; eight times the real sun, so that shadows have a soft edge
+SUN_APERTURE = 4.0  # degrees; eight times that of the real sun, so that shadows have soft edges
 SUN_SCALE, SKY_SCALE, TURBIDITY = 1.6, 3.6, 5.0
-SATURATION = 0.5  # of sun and sky; less blue lets the colours of metals read
+SATURATION = 0.5  # of sun and sky; in less blue light the colours of metals are easier to see
 GROUND_RADIANCE, HORIZON_BLUR = (0.28, 0.28, 0.28), 0.12
 LAMP_POSITION, LAMP_SIZE, LAMP_RADIANCE = (2.6, -2.4, 3.6), 0.17, (46.0, 42.0, 36.0)
 
 
 class Softbox(NamedTuple):
-    """A rectangle of light far away: where its middle is, half its sides and the width of its edge as seen from the
-    ball [degrees], its turn about the line of sight [degrees], and its radiance."""
+    """A rectangle of light, far away.
+
+    `towards`: direction of its middle. `half`: half its width and half its height, as angles seen from the ball
+    [degrees]. `edge`: width of its soft edge [degrees]. `turn`: rotation about the line of sight [degrees].
+    `radiance`: linear sRGB.
+    """
 
     towards: tuple[float, float, float]
     half: tuple[float, float]
@@ -40,7 +45,7 @@ class Softbox(NamedTuple):
     radiance: Colour
 
     def coverage(self, direction: Array) -> Array:
-        """How much of the light is seen in these directions (..., 3): 1 inside, 0 outside, soft between."""
+        """How much of the light is seen in directions (..., 3): (...), 1 inside, 0 outside, smooth across the edge."""
         middle = np.array(self.towards) / np.linalg.norm(self.towards)
         right = np.cross(middle, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
@@ -57,11 +62,11 @@ class Softbox(NamedTuple):
 
 
 SOFTBOXES = (
-    # The key on the left, two panes with a bar between them. It has most of the power: others cost noise where they
-    # do not shine.
+    # The main light, on the left: two panes with a bar between them. It has most of the power, because a sample spent
+    # on another light is wasted wherever that light does not reach.
     Softbox((-0.93, -0.42, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
     Softbox((-0.70, -0.72, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
-    Softbox((0.92, -0.15, 0.42), (1.8, 28.0), 1.0, 8.0, (11.8, 12.5, 13.7)),  # a strip on the right
+    Softbox((0.92, -0.15, 0.42), (1.8, 28.0), 1.0, 8.0, (11.8, 12.5, 13.7)),  # strip on the right
     Softbox((0.05, 0.70, 0.72), (32.0, 1.8), 1.0, 0.0, (9.4, 9.4, 9.4)),  # a bar above and behind
     Softbox((-0.85, 0.50, 0.25), (1.8, 18.0), 1.0, 0.0, (8.8, 8.8, 8.8)),  # a strip behind, on the left
 )
@@ -70,10 +75,10 @@ SKY_RISE = 0.55  # sine of the elevation where the sky is as bright as at the ze
 
 
 def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
-    """The lights of that name, by their keys in the scene.
+    """Mitsuba's dictionaries of the lights of a named lighting, by their keys in the scene.
 
     Raises:
-        ParamError: no lighting has that name; or it has no sun that could be hidden.
+        ParamError: no lighting has that name, or `hide_sun` is set and the lighting has no sun.
     """
     if lighting not in LIGHTINGS:
         raise ParamError(f"unknown lighting {lighting!r}; take {' or '.join(LIGHTINGS)}")
@@ -85,10 +90,10 @@ def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
 
 
 def environment(path: Path, scale: float) -> dict[str, Any]:
-    """An environment map alone.
+    """An environment map as the only light: Mitsuba's dictionary, under the key `sky`.
 
     Raises:
-        ParamError: there is no such file, it is no image, or has pixels that are not finite.
+        ParamError: the file does not exist, is not an image, or has pixels that are not finite.
     """
     if not path.is_file():
         raise ParamError(f"environment map {path} does not exist; pass an EXR or HDR file")
@@ -105,8 +110,8 @@ def environment(path: Path, scale: float) -> dict[str, Any]:
 def studio_radiance(height: int = 512) -> NDArray[np.float32]:
     """The studio as an image: (height, 2 height, 3) linear sRGB, latitude-longitude, up at the top.
 
-    Softboxes hang in a dim dome that darkens towards the horizon, so that smooth coats have edges to reflect. No light
-    is small or very bright: paths that meet one by chance add little noise.
+    The softboxes hang in a dim dome that darkens towards the horizon, so that smooth coats have edges to reflect. No
+    light is small or very bright, so a path that hits a light by chance adds little noise.
     """
     direction = sky_directions(height)
     rise = smoothstep(direction[..., 2:] / SKY_RISE)
@@ -120,9 +125,9 @@ def studio_radiance(height: int = 512) -> NDArray[np.float32]:
 def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.float32]:
     """Mitsuba's `sunsky` as an image: (height, 2 height, 3) linear sRGB, latitude-longitude, up at the top.
 
-    As an image its sun is importance-sampled: lighting the floor alone, 51 times less variance per sample than the
-    emitter itself. At the horizon the model, black below, goes over softly into the floor's colour; further down
-    the floor hides everything, and black wastes no samples.
+    Mitsuba importance-samples the sun of an image. A scene of the floor alone then has 51 times less variance per
+    sample than with the `sunsky` emitter. The model is black below the horizon, so this image fades into the floor's
+    colour there. Further down it stays black: the floor hides that part, and black pixels take no samples.
     """
     import drjit as dr
     import mitsuba as mi
@@ -131,7 +136,7 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
     if variant is None:
         raise ParamError("sky_radiance needs a variant of Mitsuba; call nma.render.use() first")
     if "scalar" in variant:
-        # The model is evaluated for all pixels at once.
+        # The model is evaluated for all pixels at once, which scalar variants cannot do.
         ensure_llvm()
         mi.set_variant("llvm_ad_rgb")
         try:
@@ -141,7 +146,7 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
     model = {"type": "sunsky", "sun_direction": list(SUN_DIRECTION), "sun_aperture": SUN_APERTURE}
     model |= {"sun_scale": sun_scale, "sky_scale": SKY_SCALE, "turbidity": TURBIDITY}
 
-    # Look a little above the horizon for all directions below it, then blend to the ground's colour.
+    # Directions below the horizon take the sky's colour just above it; then they are blended with the ground's colour.
     cosine = sky_directions(height)[..., 2]
     direction = sky_directions(height, lowest=0.01).reshape(-1, 3)
     si = dr.zeros(mi.SurfaceInteraction3f, len(direction))
@@ -154,7 +159,8 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
 
 
 def sky_directions(height: int, lowest: float = -1.0) -> Array:
-    """Where the pixels of a latitude-longitude image lie: (height, 2 height, 3), z up and at least `lowest`."""
+    """The direction of each pixel of a latitude-longitude image: (height, 2 height, 3), z up; z is at least
+    `lowest`."""
     azimuth = (np.arange(2 * height) + 0.5) / height * np.pi
     polar = (np.arange(height) + 0.5) / height * np.pi
     azimuth, polar = np.meshgrid(azimuth, polar)
@@ -164,14 +170,14 @@ def sky_directions(height: int, lowest: float = -1.0) -> Array:
 
 
 def smoothstep(x: Array) -> Array:
-    """From 0 below 0 to 1 above 1, without a kink."""
+    """A smooth step of the shape of x: 0 where x < 0, 1 where x > 1, and 3 x^2 - 2 x^3 between."""
     t = np.clip(x, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def _read_only(radiance: Array) -> NDArray[np.float32]:
     made = radiance.astype(np.float32)
-    made.flags.writeable = False  # it is cached
+    made.flags.writeable = False  # callers share the cached array
     return made
 
 
@@ -195,7 +201,7 @@ def _lamp() -> dict[str, Any]:
 
 
 def _upright() -> Any:
-    """From Mitsuba's environment maps, y up, to the scene, z up."""
+    """The transform from Mitsuba's environment maps, where y is up, to the scene, where z is up."""
     import mitsuba as mi
 
     return mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0)

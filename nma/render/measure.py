@@ -1,4 +1,4 @@
-"""Time and noise of a rendering, over independent seeds; and a test whether two renderings have the same mean."""
+"""Measures time and noise of a rendering over independent seeds, and tests whether two renderings have equal means."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Array = NDArray[np.float64]
 
 
 class Measurement(NamedTuple):
-    """What several runs of one rendering say.
+    """The result of several runs of one rendering, each with its own seed.
 
-    `mean`, `variance`: (height, width, 3) float64; the unbiased variance of ONE run of `spp` samples, not of the mean.
-    `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`: median wall time of a run.
-    `compile_seconds`: what the first frame took beyond that; 0 without warm-up. `times`: each run's seconds.
+    `mean`: (height, width, 3) float64. `variance`: of the same shape, the unbiased variance of ONE run of `spp`
+    samples, not of the mean. `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`: median wall time of
+    a run. `compile_seconds`: how much longer the warm-up took; 0 without warm-up. `times`: seconds of each run.
     """
 
     mean: Array
@@ -38,15 +38,15 @@ class Measurement(NamedTuple):
 
     @property
     def efficiency(self) -> float:
-        """1 / (variance * seconds), the usual Monte Carlo efficiency."""
+        """Monte Carlo efficiency: 1 / (variance * seconds)."""
         return 1.0 / max(self.mean_variance * self.seconds, 1e-300)
 
 
 class Agreement(NamedTuple):
     """Result of `zscore_images`.
 
-    `p_values`: two-sided, one for each tested block and channel. `level`: a p-value below it rejects, after Sidak's
-    correction. `passed`: none does. `worst`: (row, column, channel) of the smallest p-value, in blocks.
+    `p_values`: (rows, columns, channels) of blocks, two-sided. `level`: smaller p-values reject; it includes Sidak's
+    correction. `passed`: whether no p-value is below `level`. `worst`: (row, column, channel) of the smallest p-value.
     """
 
     p_values: Array
@@ -64,22 +64,24 @@ def measure(
     progress: Callable[[], None] = lambda: None,
     **render_options: Any,
 ) -> Measurement:
-    """Render a loaded scene once for each seed; every run is evaluated to its end before the clock stops.
+    """Render a loaded scene once for each seed. The clock of a run stops when all its kernels have finished.
 
     Args:
         scene: what `mi.load_dict` returned.
         spp: samples per pixel of each run.
-        seeds: how many, 0 to n - 1, or the seeds themselves; all different, at least 2.
-        warmup: render once before, with another seed, so that no run pays for compilation.
-        progress: called after each run, the one for warm-up included.
+        seeds: how many seeds to take (0 to n - 1), or the seeds themselves; at least 2, all different.
+        warmup: first render once with another seed, so that no measured run includes compilation.
+        progress: called after each run, also after the warm-up.
         render_options: passed to `mi.render`, such as `sensor` or `integrator`.
 
     Raises:
-        ParamError: fewer than two seeds, or a seed twice.
+        ParamError: there are fewer than two seeds, or two of them are equal.
     """
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if len(numbers) < 2 or len(set(numbers)) < len(numbers):
-        raise ParamError(f"measure: seeds {numbers} must be at least two different ones, or their number")
+        raise ParamError(
+            f"measure: seeds {numbers} will not do; pass at least two different seeds, or their count"
+        )
     first = 0.0
     if warmup:
         first = render_seconds(scene, spp, max(numbers) + 1, **render_options)[1]
@@ -100,7 +102,8 @@ def measure(
 
 
 def render_seconds(scene: Any, spp: int, seed: int, **render_options: Any) -> tuple[Array, float]:
-    """One rendering as float64 (height, width, channels), and its wall time in seconds until the kernels have run."""
+    """One rendering (height, width, channels) as float64, and its wall time in seconds until all kernels have
+    finished."""
     import drjit as dr
     import mitsuba as mi
 
@@ -127,23 +130,26 @@ def zscore_images(
 ) -> Agreement:
     """Test whether two renderings have the same expectation everywhere, pixel by pixel and channel by channel.
 
-    A Z-test with estimated variances, that is Welch's t-test (Jung, Hanika and Dachsbacher 2020), whose degrees of
-    freedom come from Welch and Satterthwaite; with many runs it is the normal test. The level of one test is Sidak's,
-    1 - (1 - false_alarm)^(1/tests), so that equal images fail with about that probability in total. Runs of few samples
-    are far from normal where light is rare, and then alarm too often: prefer few long runs to many short ones there.
+    This is Welch's t-test, a Z-test with estimated variances (Jung, Hanika and Dachsbacher 2020). Its degrees of
+    freedom come from Welch and Satterthwaite; with many runs it becomes the normal test. Each single test has Sidak's
+    level, 1 - (1 - false_alarm)^(1/tests), so that the probability that any of them rejects equal images is about
+    `false_alarm`. Where few paths find light, runs of few samples are far from normally distributed and fail too often:
+    then prefer few long runs to many short runs.
 
-    scipy is needed; it comes with the extras `compare` and `train`.
+    It needs scipy, which comes with the extras `compare` and `train`.
 
     Args:
-        mean_a, variance_a, runs_a: (height, width, channels) mean and variance of one run over that many runs.
-        mean_b, variance_b, runs_b: the same for the other rendering. `runs` = 1 and variance 0 is an exact image.
-        false_alarm: chance that equal renderings are rejected.
-        block: average squares of this many pixels first. Small differences everywhere then stand out of the noise.
-            Needs independent pixels, as with the box filter. Rows and columns that fill no block are left out.
-        rounding: relative difference that single precision explains; it adds to the standard error.
+        mean_a, variance_a, runs_a: mean over the runs and variance of one run, both (height, width, channels), and the
+            number of runs.
+        mean_b, variance_b, runs_b: the same for the other rendering. Pass 1 run and variance 0 for an exact image.
+        false_alarm: probability that equal renderings are rejected.
+        block: average squares of block x block pixels before the test, so that small differences everywhere rise above
+            the noise. Pixels must be independent, as they are with the box filter. Rows and columns that fill no block
+            are left out.
+        rounding: relative difference that single precision may cause; it adds to the standard error.
 
     Raises:
-        ImageError: different shapes, values that are not finite, a block larger than the image.
+        ImageError: the shapes differ, values are not finite, or a block is larger than the image.
     """
     from scipy.stats import t as student
 
@@ -158,7 +164,7 @@ def zscore_images(
         )
     a, var_a, b, var_b = (_blocks(array, block) for array in arrays)
 
-    # Standard errors of the block means, and how well their estimates are known (Welch and Satterthwaite).
+    # Squared standard errors of the block means, and their degrees of freedom (Welch and Satterthwaite).
     pixels = block**2
     error = var_a / (runs_a * pixels) + var_b / (runs_b * pixels)
     spread = sum(
@@ -175,7 +181,7 @@ def zscore_images(
 
 
 def _blocks(image: Array, block: int) -> Array:
-    """Means over block x block pixels."""
+    """Means over squares of block x block pixels: (rows, columns, channels)."""
     height, width = (extent // block for extent in image.shape[:2])
     if height == 0 or width == 0:
         raise ImageError(

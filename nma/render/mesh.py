@@ -1,4 +1,4 @@
-"""A mesh from a file in place of the shader ball."""
+"""Loads a mesh from a file, to show it in place of the shader ball."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from nma.errors import NmaError, one_line
 
 KINDS = {".ply": "ply", ".obj": "obj"}
 AXES = ("z", "y")
-WIDTH, HEIGHT = 2.0, 2.12  # of the shader ball, which the mesh may fill
-LIFT = 1e-3  # above the floor, so that flat meshes are seen
+WIDTH, HEIGHT = 2.0, 2.12  # of the shader ball; the mesh is scaled to fit into them
+LIFT = 1e-3  # height above the floor, so that flat meshes are visible
 ATTRIBUTES = {"positions": 3, "normals": 3, "texcoords": 2}
 
 
@@ -24,9 +24,9 @@ class MeshError(NmaError, ValueError):
 
 
 def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) -> dict[str, Any]:
-    """Mitsuba's dictionary of a mesh that stands on the floor where the shader ball would, as large as that.
+    """Mitsuba's dictionary of a mesh that stands in the place of the shader ball and has its size.
 
-    Normals and texture coordinates are those of the file; normals that are missing Mitsuba computes.
+    Normals and texture coordinates come from the file; Mitsuba computes normals that are missing.
 
     Args:
         path: a PLY or OBJ file.
@@ -34,8 +34,8 @@ def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) ->
         coordinates: whether texture coordinates are needed.
 
     Raises:
-        MeshError: no such file, not a mesh, one without triangles or extent, numbers that are not finite, missing
-            texture coordinates, or an unknown axis.
+        MeshError: the file does not exist or is not a mesh; the mesh has no triangles, no extent, values that are not
+            finite, or no texture coordinates although they are needed; or the axis is unknown.
     """
     import mitsuba as mi
 
@@ -53,7 +53,7 @@ def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) ->
 
 
 def needs_coordinates(bsdf: Mapping[str, Any]) -> bool:
-    """Whether a BSDF's dictionary has a texture or an anisotropic adapter, which need coordinates on the surface."""
+    """Whether a BSDF needs texture coordinates: its dictionary has a texture or an anisotropic adapter."""
     import mitsuba as mi
 
     if bsdf.get("type") == "nma" and "adapter" in bsdf and Adapter.load(bsdf["adapter"]).anisotropic:
@@ -76,7 +76,8 @@ def _load(description: dict[str, Any], path: str | Path) -> Any:
     import mitsuba as mi
 
     try:
-        # Where Mitsuba computes normals it stumbles without triangles, and writes wherever their corners point.
+        # Computing normals, Mitsuba fails without triangles and writes out of bounds for wrong vertex indices, so the
+        # faces are checked first, on a mesh whose normals it does not compute.
         _check_faces(mi.load_dict(description | {"face_normals": True}), path)
         return mi.load_dict(description)
     except RuntimeError as error:
@@ -93,13 +94,14 @@ def _check_faces(mesh: Any, path: str | Path) -> None:
     if beyond.any():
         first = int(np.argmax(beyond))
         raise MeshError(
-            f"mesh {path}: triangle {first // 3} has the vertex {corners[first]}, "
-            f"but there are {mesh.vertex_count()} of them, counted from 0; export it anew"
+            f"mesh {path}: triangle {first // 3} refers to vertex {corners[first]}, "
+            f"but the mesh has {mesh.vertex_count()} vertices, counted from 0; export it again"
         )
 
 
 def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:
-    """The corners of the triangles (n, 3); all that the mesh holds is checked."""
+    """The corners (n, 3) of all triangles in turn. Checks that positions, normals and texture coordinates are
+    finite."""
     import mitsuba as mi
 
     params = mi.traverse(mesh)
@@ -108,21 +110,21 @@ def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             raise MeshError(
-                f"mesh {path}: {name} of vertex {np.argmax(bad)} are NaN or infinite; export it anew"
+                f"mesh {path}: {name} of vertex {np.argmax(bad)} are NaN or infinite; export it again"
             )
     faces = np.array(params["faces"], dtype=np.int64)
     return np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)[faces]
 
 
 def _place(points: NDArray[np.float64], path: str | Path) -> Any:
-    """Where the bounding box has to go: onto the floor, in the middle."""
+    """The transform that puts the mesh on the middle of the floor and scales it to the ball's size."""
     import mitsuba as mi
 
     low, high = points.min(axis=0), points.max(axis=0)
     extent = high - low
     room = np.array([WIDTH, WIDTH, HEIGHT])
     if extent.max() <= 0.0:
-        raise MeshError(f"mesh {path} has no extent: all of its vertices are one point")
+        raise MeshError(f"mesh {path} has no extent: all its vertices are the same point")
     scale = float((room / np.maximum(extent, 1e-9 * extent.max())).min())
     middle = (low + high) / 2.0
     shift = [-scale * middle[0], -scale * middle[1], LIFT - scale * low[2]]

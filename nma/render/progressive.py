@@ -1,4 +1,4 @@
-"""Rendering in passes, so that a long rendering shows how far it is."""
+"""Renders in passes, so that a long rendering can report its progress."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from nma.errors import ParamError, one_line
 from nma.images.size import MOST_PIXELS
 from nma.render.load import SceneError
 
-# Samples of one pass over the whole picture: a few seconds on two cores, and a bound on memory. A pixel of 512 x 512
-# has 16 of them: the more are laid out together, the less noise they leave.
+# Samples of one pass, over the whole picture. They take a few seconds on two cores, and they bound the memory. At 512 x
+# 512 pixels this is 16 samples per pixel. More samples per pass leave less noise, because the sampler stratifies within
+# a pass.
 SAMPLES_PER_PASS = 1 << 22
 
 
@@ -27,19 +28,19 @@ def render_passes(
     integrator: Any = None,
     progress: Callable[[int], None] = lambda samples: None,
 ) -> NDArray[np.float32]:
-    """Render a loaded scene in passes of equal size and average them: (height, width, channels).
+    """Render a loaded scene in passes and average them: (height, width, channels) float32.
 
-    Equal seeds give equal pictures. Passes draw from streams of their own, also those of neighbouring seeds.
+    Equal seeds give equal pictures. Every pass of every seed has its own random stream.
 
     Args:
         scene: what `mi.load_dict` or `mi.load_file` returned.
         spp: samples per pixel in total; the last pass may be smaller than the others.
-        integrator: another one than the scene's.
-        progress: called after each pass with its samples per pixel.
+        integrator: an integrator to use in place of the scene's.
+        progress: called after each pass with the samples per pixel of that pass.
 
     Raises:
-        ParamError: spp below 1, or more pixels than `MOST_PIXELS`.
-        SceneError: there is no integrator, or Mitsuba fails; the message says why.
+        ParamError: spp is below 1, or there are more pixels than `MOST_PIXELS`.
+        SceneError: the scene has no integrator, or Mitsuba fails; the message says why.
     """
     import mitsuba as mi
 
@@ -63,16 +64,19 @@ def render_passes(
 
 
 def check_size(size: tuple[int, int]) -> None:
-    """Refuses pictures that are too large, before they take memory. Raises `ParamError`."""
+    """Raises `ParamError` for pictures of more than `MOST_PIXELS` pixels, before memory is taken."""
     if size[0] * size[1] > MOST_PIXELS:
         raise ParamError(
-            f"a picture of {size[0]} x {size[1]} pixels is too large; at most {MOST_PIXELS:,} are rendered, "
+            f"a picture of {size[0]} x {size[1]} pixels is too large; take at most {MOST_PIXELS:,} pixels, "
             "16384 x 8192 for example"
         )
 
 
 def pass_sizes(spp: int, pixels: int) -> list[int]:
-    """Samples per pixel of each pass: equal but for the last, and such that they fill grids where that can be."""
+    """Samples per pixel of each pass. All passes are equal, except that the last may be smaller.
+
+    The counts suit the multi-jittered sampler's grids where possible.
+    """
     most = max(SAMPLES_PER_PASS // pixels, 1)
     equal = -(-spp // -(-spp // most))
     filling = (n for n in range(equal, equal // 2, -1) if _fills_grid(n) and _fills_grid(spp % n))
@@ -81,15 +85,15 @@ def pass_sizes(spp: int, pixels: int) -> list[int]:
 
 
 def sampler(spp: int, pixels: int) -> str:
-    """Mitsuba's sampler that leaves the least noise: multi-jittered where all passes fill a grid, as it demands."""
+    """The Mitsuba sampler with the least noise: "multijitter" where all passes fill its grid, else "independent"."""
     return "multijitter" if all(map(_fills_grid, pass_sizes(spp, pixels))) else "independent"
 
 
 def _fills_grid(samples: int) -> bool:
-    """Whether Mitsuba's multi-jittered sampler takes this number as it is; it rounds others up."""
+    """Whether Mitsuba's multi-jittered sampler takes exactly this sample count; it rounds other counts up."""
     return samples % max(math.isqrt(samples), 1) == 0
 
 
 def _pass_seed(seed: int, number: int) -> int:
-    """Hashed, as seed + number would repeat passes of the next seed."""
+    """The seed of pass `number`. It is a hash: seed + number would repeat passes of the next seed."""
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])

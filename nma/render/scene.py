@@ -1,11 +1,11 @@
 """The material-preview scene: the shader ball, or a mesh, on graph paper under a lighting of `nma.render.lighting`.
 
-Made by code alone, no assets. Everything is a Mitsuba dictionary, so it can be changed before `mi.load_dict`. Names
-that `mi.traverse` shows: `material.*` is the material under test, `floor.*` the paper, `sky.*`, outdoors `lamp.*`,
-`sensor.*`. The only shape with the material is `ball`.
+Code makes all of it; there are no asset files. The scene is a Mitsuba dictionary, so callers can change it before
+`mi.load_dict`. `mi.traverse` shows these names: `material.*` is the material under test, `floor.*` the paper, `sky.*`
+the sky, `lamp.*` the lamp (outdoors only), `sensor.*` the camera. Only the shape `ball` has the material.
 
-Lengths are in units of the shell's radius, z is up. Radiance is scaled so that exposure 0 suits the picture
-(`nma.images.io.tonemap`): perfectly white paper outdoors has radiance 0.77 in the sun.
+Lengths are in units of the shell's radius, and z is up. Radiance is scaled so that pictures look right at exposure 0
+(`nma.images.io.tonemap`): outdoors, perfectly white paper has radiance 0.77 in the sun.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ CAMERAS: dict[str, Camera] = {
     "top": Camera((0.25, -2.0, 5.6), (0.0, -0.02, 0.9), 26.0),
 }
 
-PAPER_SIZE = 240.0  # side of the floor; the pattern fades out well before
+PAPER_SIZE = 240.0  # side of the floor; the pattern fades out far from the edge
 PAPER_PATTERN = 24.0  # side of the part that carries the pattern
-# How light it is far away, how much more near, and how strong the pattern.
+# Reflectance of the paper far away, what is added to it near the ball, and the contrast of the pattern.
 PAPER_TONE = {"outdoors": (0.60, 0.25, 1.0), "studio": (0.08, 0.45, 0.5)}
 
 
@@ -70,26 +70,27 @@ def preview_scene(
         bsdf: Mitsuba dictionary of the material; it is placed under the key `material`.
         size: width and height in pixels.
         spp: samples per pixel, the default of `mi.render(scene)`.
-        max_depth: longest path in edges, as Mitsuba counts (1 is emission alone).
+        max_depth: longest path in edges, as Mitsuba counts them (1 shows emission only).
         camera: a name in `CAMERAS`, a `Camera`, or None for "hero".
         envmap: an EXR or HDR file, latitude-longitude, y up in the file. It replaces all other light.
         envmap_scale: factor on the environment map's radiance.
-        lighting: "studio", softboxes in a dim dome, or "outdoors", sun, sky and a small lamp.
-        mesh: a PLY or OBJ file to show in place of the shader ball, moved and scaled to its size.
+        lighting: "studio" (softboxes in a dim dome) or "outdoors" (sun, sky and a small lamp).
+        mesh: a PLY or OBJ file to show in place of the shader ball, moved to its place and scaled to its size.
         mesh_up: the axis of that file that points up, "z" or "y".
-        integrator: "path", "prb", another integrator of Mitsuba's that takes `max_depth`, or a whole dictionary.
-        hide_sun: outdoors, leave out the disc of the sun, keep the sky and the lamp.
+        integrator: "path", "prb", the name of another Mitsuba integrator that takes `max_depth`, or the dictionary of
+            an integrator.
+        hide_sun: leave out the disc of the sun; the sky and the lamp stay. For "outdoors" only.
         rfilter: reconstruction filter of the film. "box" keeps pixels statistically independent.
-        sampler: Mitsuba's. "multijitter" leaves less noise, and takes certain numbers of samples alone:
+        sampler: name of a Mitsuba sampler. "multijitter" leaves less noise, but takes only certain sample counts; see
             `nma.render.progressive.sampler`.
 
     Returns:
         A new dictionary; nothing in it is shared with other calls.
 
     Raises:
-        ParamError: an unknown camera or lighting, a size or spp that is not positive, a missing environment map, no
-            variant of Mitsuba in use.
-        MeshError: a mesh that cannot be shown, see `nma.render.mesh.mesh_shape`.
+        ParamError: the camera or the lighting is unknown, the size or spp is not positive, the environment map is
+            missing, or no variant of Mitsuba is in use.
+        MeshError: the mesh cannot be shown; see `nma.render.mesh.mesh_shape`.
     """
     import mitsuba as mi
 
@@ -111,7 +112,7 @@ def preview_scene(
 
 
 def resolve_camera(camera: str | Camera | None) -> Camera:
-    """The camera of that name, or the camera itself; None means "hero".
+    """The camera: looked up in `CAMERAS` where a name is given, "hero" for None.
 
     Raises:
         ParamError: no camera has that name.
@@ -130,7 +131,8 @@ def resolve_camera(camera: str | Camera | None) -> Camera:
 def material_mask(
     size: tuple[int, int] = (256, 256), camera: str | Camera | None = None
 ) -> NDArray[np.bool_]:
-    """Which pixels show the material: (height, width), by one camera ray through the middle of each pixel."""
+    """Which pixels show the material: (height, width) booleans, from one camera ray through the middle of each
+    pixel."""
     import drjit as dr
     import mitsuba as mi
 
@@ -140,13 +142,13 @@ def material_mask(
     middle = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, middle, mi.Point2f(0.5))
 
-    # The identifiers of the shapes' pointers tell the ball from the floor.
+    # Comparing the shapes' pointers tells the ball from the floor.
     ball = next(shape for shape in scene.shapes() if shape.id() == "ball")
     return np.array(scene.ray_intersect(ray).shape == mi.ShapePtr(ball)).reshape(height, width)
 
 
 def material_coverage(size: tuple[int, int] = (256, 256), camera: str | Camera | None = None) -> float:
-    """Share of the pixels, 0 to 1, whose camera ray meets the material first."""
+    """The share of the pixels, 0 to 1, whose camera ray hits the material first."""
     return float(material_mask(size, camera).mean())
 
 
@@ -176,7 +178,8 @@ def _sensor(camera: Camera, size: tuple[int, int], spp: int, rfilter: str, sampl
 
 
 def _floor(far: float, near: float, contrast: float) -> dict[str, Any]:
-    """A large sheet of graph paper whose pattern fades out, so that its far edge is one soft grey against the sky."""
+    """A large sheet of graph paper. Its pattern fades out with distance, so that the far edge is plain grey against the
+    sky."""
     import mitsuba as mi
 
     pattern = bitmap_texture(_graph_paper(1536, far, near, contrast))
@@ -196,7 +199,7 @@ def _floor(far: float, near: float, contrast: float) -> dict[str, Any]:
 
 @lru_cache(maxsize=2)
 def _graph_paper(size: int, far: float, near: float, contrast: float) -> NDArray[np.float32]:
-    """Linear reflectance (size, size, 3) of the paper: fine lines, bold lines, alternate squares a little darker."""
+    """Linear reflectance (size, size, 3) of the paper, with fine lines, bold lines, and every other square darker."""
     place = (np.arange(size) + 0.5) / size * PAPER_PATTERN - PAPER_PATTERN / 2.0
     x, y = np.meshgrid(place, place)
     texel = PAPER_PATTERN / size

@@ -1,9 +1,10 @@
 """A shader ball made by code: an open shell with a groove, a small ball inside it, and the ring it stands on.
 
 Every part is a solid of revolution, so texture coordinates follow from the construction: u runs around the axis, v
-along the profile. The axes point so that no pole, where u shrinks to a point, faces the default camera.
+along the profile. At a pole all values of u meet in one point; the axes are chosen so that no pole faces the default
+camera.
 
-Units: the shell's outer radius is 1. The ring stands on the plane z = 0, z is up.
+The shell's outer radius is 1. The ring stands on the plane z = 0, and z is up.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ Array = NDArray[np.float64]
 
 SHELL_CENTRE = np.array([0.0, 0.0, 1.12])
 SHELL_AXIS = np.array([0.56, -0.66, 0.50])  # the opening looks along this direction
-SHELL_OPENING = np.radians(52.0)  # polar angle of the lip's top
+SHELL_OPENING = np.radians(52.0)  # polar angle of the top of the lip
 LIP_RADIUS = 0.07
-CAVITY_OFFSET = 0.16  # the cavity is part of a sphere whose centre lies this far along the axis
+CAVITY_OFFSET = 0.16  # the cavity is part of a sphere; its centre lies this far along the axis
 GROOVE_ANGLE = np.radians(76.0)
 GROOVE_HALF_WIDTH = np.radians(3.6)
 GROOVE_DEPTH = 0.055
@@ -53,7 +54,7 @@ def shader_ball(detail: float = 1.0) -> Mesh:
         detail: factor on the number of segments in both directions; 1 gives about 54,000 triangles.
 
     Returns:
-        A closed, outward-facing mesh with smooth normals; u and v repeat with period 1.
+        A closed mesh whose faces and smooth normals point outwards; textures repeat with period 1 in u and v.
     """
     shell = revolve(
         _shell_profile(), round(200 * detail), round(100 * detail), SHELL_AXIS, repeats=TEXELS_PER_TURN
@@ -71,14 +72,16 @@ def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int
     """Turn a profile around an axis through the origin.
 
     Args:
-        profile: (n, 2) points (radius, height), dense; the surface lies to the left of the direction of travel.
+        profile: (n, 2) points (radius, height), close together; the outside of the surface is to the left of the
+            direction of travel.
         turns: segments around the axis.
-        steps: segments along the profile, spread evenly over its length and its turning.
-        axis: direction of the height, any length.
-        repeats: how often u runs from 0 to 1 in one turn; v is scaled to match at the largest radius.
+        steps: segments along the profile; they are shorter where the profile turns.
+        axis: direction of the axis of revolution, of any length.
+        repeats: how often u runs from 0 to 1 in one turn; v is scaled so that textures are not stretched at the largest
+            radius.
 
     Returns:
-        The mesh, with normals from the profile's tangent.
+        The mesh; its normals come from the profile's tangent.
     """
     radius, height, normal, length = _resample(profile, steps)
     phi = np.linspace(0.0, 2.0 * np.pi, turns + 1)
@@ -100,7 +103,7 @@ def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int
 
 @lru_cache(maxsize=4)
 def shader_ball_file(detail: float = 1.0) -> Path:
-    """Path of the shader ball as a binary PLY file in this process's temporary folder, written on the first call."""
+    """The path of a binary PLY file of the shader ball. The first call writes it to this process's temporary folder."""
     path = _scratch_folder() / f"shaderball-{detail:g}.ply"
     write_ply(path, shader_ball(detail))
     return path
@@ -126,25 +129,26 @@ def _scratch_folder() -> Path:
 
 
 def _arc(radius: float | Array, start: float, stop: float, count: int = 2000) -> Array:
-    """Points at polar angles from start to stop; `radius` may vary along the arc."""
+    """Points (count, 2) of an arc, as (radius, height), at polar angles from start to stop; `radius` may vary."""
     theta = np.linspace(start, stop, count)
     return np.stack([radius * np.sin(theta), radius * np.cos(theta)], axis=-1)
 
 
 def _cavity() -> tuple[Array, float]:
-    """The middle of the lip's rounding (radius, height), and the radius of the cavity that touches it smoothly."""
+    """The centre (radius, height) of the rounded lip, and the radius of the cavity's sphere, which joins the lip
+    smoothly."""
     middle = (1.0 - LIP_RADIUS) * np.array([np.sin(SHELL_OPENING), np.cos(SHELL_OPENING)])
     return middle, float(np.hypot(middle[0], middle[1] - CAVITY_OFFSET) - LIP_RADIUS)
 
 
 def _core_centre() -> Array:
-    """The small ball lies where gravity takes it: at the lowest point of the cavity."""
+    """The centre of the small ball, which rests on the lowest point of the cavity."""
     down = np.array([0.0, 0.0, CORE_RADIUS - _cavity()[1]])
     return SHELL_CENTRE + CAVITY_OFFSET * SHELL_AXIS / np.linalg.norm(SHELL_AXIS) + down
 
 
 def _shell_profile() -> Array:
-    """From the pole of the cavity over the lip, down the outside with its groove, to the outer pole."""
+    """The profile from the pole of the cavity over the lip and down the grooved outside to the outer pole."""
     middle, radius = _cavity()
     rim = np.arctan2(middle[0], middle[1] - CAVITY_OFFSET)
     inside = _arc(radius, np.pi, rim) + np.array([0.0, CAVITY_OFFSET])
@@ -160,7 +164,7 @@ def _shell_profile() -> Array:
 
 
 def _ring_profile() -> Array:
-    """A rounded ring: a rectangle with quarter circles at its four corners, closed, seen from outside."""
+    """The closed profile of the ring: a rectangle with rounded corners."""
     inner, outer = RING_RADII
     corner = 0.07
     angle = np.linspace(0.0, np.pi / 2.0, 200)
@@ -175,7 +179,7 @@ def _ring_profile() -> Array:
     ]
     points = np.concatenate([*arcs, arcs[0][:1]])
 
-    # Fill the straight pieces, so that every piece of the polygon is short.
+    # Add points along the straight sides, so that every segment is short.
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     fine = np.union1d(along, np.linspace(0.0, along[-1], 2000))
     return np.stack([np.interp(fine, along, points[:, axis]) for axis in (0, 1)], axis=-1)
@@ -189,7 +193,7 @@ def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
     points = np.concatenate([start, profile[-1:]])
     length = np.concatenate([[0.0], np.cumsum(piece)])
 
-    # Angles at the middles of the pieces, interpolated to their ends; a closed profile wraps around.
+    # The tangent's angle at the middle of each segment, interpolated to the segments' ends.
     angle = np.unwrap(np.arctan2(delta[:, 1], delta[:, 0]))
     middles = (length[:-1] + length[1:]) / 2.0
     at_points = np.interp(length, middles, angle)
@@ -203,7 +207,7 @@ def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _grid_faces(rows: int, columns: int, radius: Array) -> NDArray[np.int32]:
-    """Two triangles for each cell of a grid of vertices, leaving out those without area at a pole."""
+    """Two triangles (m, 3) for each cell of a grid of vertices; triangles without area at a pole are left out."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     lower, upper = np.stack([a, d, c], -1), np.stack([a, c, b], -1)
@@ -214,7 +218,7 @@ def _grid_faces(rows: int, columns: int, radius: Array) -> NDArray[np.int32]:
 
 
 def _frame(axis: Array) -> Array:
-    """Rows: two directions across the axis, and the axis; a right-handed rotation."""
+    """A rotation matrix whose third row is the axis; the first two rows are directions perpendicular to it."""
     z = axis / np.linalg.norm(axis)
     x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)

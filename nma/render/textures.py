@@ -1,7 +1,7 @@
-"""Arrays as textures for Mitsuba, and textures made by code: worn metal, patches of lacquer, marbled pigment.
+"""Makes Mitsuba textures from arrays, and arrays by code: worn metal, patches of lacquer, marbled pigment.
 
-The values are linear source parameters, not colours on a screen: `bitmap_texture` loads them as raw data. Those made by
-code tile, and a seed fixes them.
+The values are linear parameters of a material, not colours on a screen, so `bitmap_texture` loads them as raw data. The
+textures made by code tile, and a seed determines them.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ LACQUER = np.array([[0.93, 0.60, 0.14], [0.80, 0.10, 0.06], [0.10, 0.38, 0.42], 
 
 
 def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.float32]]:
-    """Three textures for the class `layered3`, independent patterns of one worn, lacquered object.
+    """Three textures for the class `layered3`: the independent patterns of one worn, lacquered object.
 
     Args:
         size: width and height in texels, at least 16.
-        seed: another seed gives another object; the same seed gives the same numbers.
+        seed: another seed gives another object; equal seeds give equal values.
 
     Returns:
-        `alpha_bottom` (size, size) in 1e-3..1: a polished metal with finger prints and scratches;
-        `sigma_t` (size, size) in 0..1: patches where the pigmented medium is worn off, soft at their edges;
-        `albedo` (size, size, 3) in 0..1: marbled pigments.
+        `alpha_bottom` (size, size) in 1e-3..1: a polished metal with fingerprints and scratches; `sigma_t` (size, size)
+        in 0..1: patches with soft edges where the pigmented medium is worn off; `albedo` (size, size, 3) in 0..1:
+        marbled pigments.
 
     Raises:
-        TextureError: a size below 16.
+        TextureError: the size is below 16.
     """
     if size < 16:
         raise TextureError(f"procedural_textures: size {size} is too small; take 16 or more")
@@ -46,8 +46,9 @@ def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.
 def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope: float = 2.0) -> Array:
     """Smooth noise that tiles: (size, size), mean 0, standard deviation 1.
 
-    White noise shaped in the frequency domain, where everything repeats by nature: flat up to 1/period, then falling
-    with frequency^-slope. The same seed gives the same pattern at every size.
+    It is white noise, filtered in the frequency domain: flat up to the frequency 1/period, then falling with
+    frequency^-slope. It tiles because all its frequencies are whole cycles per tile. Equal seeds give the same pattern
+    at every size.
 
     Args:
         period: size of the largest features, as a share of the texture.
@@ -62,7 +63,8 @@ def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope:
 
 
 def _low_frequencies(rng: np.random.Generator, size: int, cutoff: int = 64) -> NDArray[np.complex128]:
-    """A (size, size) spectrum of white noise up to `cutoff` cycles, the same numbers for every size that holds them."""
+    """A spectrum (size, size) of white noise up to `cutoff` cycles; at every size it has the same values up to
+    there."""
     block = rng.normal(size=(2, 2 * cutoff + 1, 2 * cutoff + 1))
     reach = min(cutoff, size // 2 - 1)
     inner = block[:, cutoff - reach : cutoff + reach + 1, cutoff - reach : cutoff + reach + 1]
@@ -78,7 +80,7 @@ def _smoothstep(low: float, high: float, x: Array) -> Array:
 
 
 def _worn_metal(rng: np.random.Generator, size: int) -> Array:
-    """log10(alpha): polished at -1.4, finger prints and scratches rougher, dull clouds roughest."""
+    """Roughness (size, size): polished metal with fingerprints, scratches and dull clouds, made in log10(alpha)."""
     clouds = periodic_noise(rng, size, period=0.35, slope=2.2)
     log_alpha = -1.35 + 0.28 * clouds
     log_alpha += 0.55 * _finger_prints(rng, size)
@@ -87,14 +89,14 @@ def _worn_metal(rng: np.random.Generator, size: int) -> Array:
 
 
 def _finger_prints(rng: np.random.Generator, size: int, count: int = 5) -> Array:
-    """Ridges in 0..1: concentric ovals bent by noise, inside soft ovals, placed around the tile."""
+    """Ridges (size, size) in 0..1: soft ovals at random places, filled with concentric ovals bent by noise."""
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
     bend = periodic_noise(rng, size, period=0.25, slope=3.0)
     prints = np.zeros((size, size))
     for _ in range(count):
         cx, cy, turn, scale = *rng.uniform(size=2), rng.uniform(0.0, np.pi), rng.uniform(0.085, 0.12)
 
-        # The nearest copy of the centre makes the print cross the border of the tile.
+        # Distances are to the nearest copy of the centre, so that a print goes on across the border of the tile.
         dx, dy = (x - cx + 0.5) % 1.0 - 0.5, (y - cy + 0.5) % 1.0 - 0.5
         along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
         oval = np.hypot(along / 1.45, across) / scale
@@ -104,7 +106,7 @@ def _finger_prints(rng: np.random.Generator, size: int, count: int = 5) -> Array
 
 
 def _scratches(rng: np.random.Generator, size: int, count: int) -> Array:
-    """Thin straight lines in 0..1 with tapering ends; each is drawn around the border of the tile."""
+    """Thin straight lines (size, size) in 0..1 with tapering ends; they go on across the border of the tile."""
     texel = 1.0 / size
     x, y = np.meshgrid((np.arange(size) + 0.5) * texel, (np.arange(size) + 0.5) * texel)
     scratches = np.zeros((size, size))
@@ -120,14 +122,14 @@ def _scratches(rng: np.random.Generator, size: int, count: int) -> Array:
 
 
 def _patches(rng: np.random.Generator, size: int) -> Array:
-    """Extinction: nearly opaque lacquer, worn through in islands, uneven in thickness."""
+    """Extinction (size, size): nearly opaque lacquer of uneven thickness, worn through in islands."""
     wear = periodic_noise(rng, size, period=0.30, slope=2.4)
     thickness = 0.85 + 0.10 * periodic_noise(rng, size, period=0.5, slope=3.0)
     return np.clip(thickness * _smoothstep(-0.75, -0.35, wear), 0.0, 1.0)
 
 
 def _marble(rng: np.random.Generator, size: int) -> Array:
-    """Pigments in bands that a warped coordinate runs through; the bands close after one tile."""
+    """Colours (size, size, 3) in bands along a warped coordinate; the bands repeat after one tile."""
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
     warp = 0.16 * periodic_noise(rng, size, period=0.45, slope=3.0) + 0.03 * periodic_noise(
         rng, size, period=0.15
@@ -141,7 +143,7 @@ def _marble(rng: np.random.Generator, size: int) -> Array:
 
 
 def bitmap_texture(values: NDArray[np.floating], *, scale: float = 1.0) -> dict[str, Any]:
-    """A Mitsuba `bitmap` dictionary around an array, without any colour conversion.
+    """Mitsuba's dictionary of a `bitmap` texture with the values of an array, without any colour conversion.
 
     Args:
         values: (height, width) or (height, width, 3), linear.
