@@ -1,8 +1,9 @@
 """The errors that this package raises. Each message says what is wrong, where, and what to do next."""
 
+import difflib
 import re
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 _TRACEBACK = "Traceback (most recent call last):"
 _LONGEST = 600  # most characters of a message: some of Mitsuba's errors print whole objects
@@ -52,6 +53,24 @@ def either(words: Iterable[str]) -> str:
     """Joins options to a text such as "a, b or c"."""
     *others, last = words
     return f"{', '.join(others)} or {last}" if others else last
+
+
+def closest(given: str, known: Sequence[str]) -> str | None:
+    """The known name that was probably meant, whatever its case."""
+    names = {name.casefold(): name for name in reversed(known)}
+    near = difflib.get_close_matches(given.casefold(), names, n=1, cutoff=0.5)
+    return names[near[0]] if near else None
+
+
+def some(names: Sequence[str]) -> str:
+    """The first few names, where there may be hundreds."""
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+
+
+def hint(given: str, known: Sequence[str]) -> str:
+    """What to say to an unknown name: the closest one, or some of those there are."""
+    near = closest(given, known)
+    return f"did you mean '{near}'?" if near else f"it has {some(known)}"
 
 
 def one_line(message: str) -> str:

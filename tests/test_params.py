@@ -141,7 +141,7 @@ def test_an_unknown_population_is_refused():
 
 
 def test_the_class_is_that_of_the_paper_s_table_1():
-    assert SPACES == {"layered3": LAYERED3, "measured": MEASURED, "library": LIBRARY}
+    assert SPACES["layered3"] == LAYERED3
     assert tuple(p.name for p in LAYERED3.params) == NAMES
     assert LAYERED3.size == 13
     assert [(s.start, s.stop) for s in LAYERED3.slices.values()] == [
@@ -269,3 +269,8 @@ def test_a_class_without_a_conductor_accepts_every_population():
     space = ParamSpace("paint", (Param("gloss", "g", "uniform", 0.0, 1.0, 0.0, 1.0, "how shiny"),))
     for population in POPULATIONS:
         assert space.sample(np.random.default_rng(0), 5, population).shape == (5, 1)
+
+
+def test_classes_are_registered_by_their_names():
+    assert {LAYERED3.name, MEASURED.name, LIBRARY.name} <= set(SPACES)
+    assert all(space.name == name for name, space in SPACES.items())

@@ -10,7 +10,6 @@ of the materials that it was trained on. Codes may be mixed, and one may be lear
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from safetensors import safe_open
 
 from nma import network
 from nma.adapter.adapter import Adapter, weights_file
-from nma.errors import ParamError, WeightsError
+from nma.errors import ParamError, WeightsError, hint
 from nma.params import LIBRARY, MEASURED
 
 CODES = "codes"
@@ -81,9 +80,9 @@ class Library:
     def code(self, name: str) -> NDArray[np.float32]:
         """The code (32,) of a material. Raises `ParamError` for a name that is not there."""
         if name not in self.names:
-            near = difflib.get_close_matches(name, self.names, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(self.names[:5])}, ..."
-            raise ParamError(f"no material '{name}' among the library's {len(self.names)}; {hint}")
+            raise ParamError(
+                f"no material '{name}' among the library's {len(self.names)}; {hint(name, self.names)}"
+            )
         return self.codes[self.names.index(name)]
 
     def mix(self, names: Sequence[str], weights: ArrayLike) -> NDArray[np.float32]:

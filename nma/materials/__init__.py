@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 import re
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.data import load_conductors
-from nma.errors import MaterialError, ParamError, either, one_line
+from nma.errors import MaterialError, ParamError, closest, either, one_line
 from nma.images.io import CHANNELS, linear
 from nma.materials.texture import Texture
 from nma.params import SPACES, Param, ParamSpace
@@ -306,7 +305,5 @@ def _refuse_unknown(given: Mapping[str, Any], known: tuple[str, ...], where: str
 
 
 def _suggestion(given: Any, known: tuple[str, ...]) -> str:
-    names = {name.casefold(): name for name in reversed(known)}
-    text = _short(given).casefold() if isinstance(given, str) else ""
-    close = difflib.get_close_matches(text, names, n=1, cutoff=0.5)
-    return f" (did you mean '{names[close[0]]}'?)" if close else ""
+    near = closest(_short(given), known) if isinstance(given, str) else None
+    return f" (did you mean '{near}'?)" if near else ""

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from nma.errors import ParamError, SourceError
+from nma.errors import ParamError, SourceError, some
 from nma.sources.base import Source, Values
 from nma.sources.files import Format
 
@@ -62,8 +62,7 @@ def read(path: str | Path, material: str | None = None) -> Values:
         return found.read(path)
     if material is None:
         names = found.names(path)
-        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-        raise SourceError(f"{path}: holds {len(names)} material(s); say which: {listed}")
+        raise SourceError(f"{path}: holds {len(names)} material(s); say which: {some(names)}")
     return found.read(path, material)
 
 

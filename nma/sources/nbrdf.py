@@ -10,14 +10,13 @@ x @ k + b.
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nma import network
-from nma.errors import SourceError
+from nma.errors import SourceError, hint
 from nma.files import arrays
 from nma.jit import dr
 from nma.ops import Color, Vec3
@@ -61,9 +60,9 @@ class Nbrdf:
         """The network of one material. Raises `SourceError` if the file is damaged or has no such material."""
         names, weights = read(path)
         if material not in names:
-            near = difflib.get_close_matches(material, names, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(names[:5])}, ..."
-            raise SourceError(f"{path}: no material '{material}' among its {len(names)}; {hint}")
+            raise SourceError(
+                f"{path}: no material '{material}' among its {len(names)}; {hint(material, names)}"
+            )
         return Nbrdf(weights[names.index(material)], f"{kind(names)} {material}")
 
 
