@@ -1,6 +1,6 @@
-"""Figures of merit of tables: means over bins and RGB of f cos(theta_o) [1/sr], one set per material.
+"""Error figures of tables: means over bins and RGB, of f cos(theta_o) [1/sr], for one material at a time.
 
-`a` is the adapter's table, `b` the reference, both (..., theta_i, theta_o, phi, 3).
+`a` is the adapter's table and `b` the reference, both (..., theta_i, theta_o, phi, 3).
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ EPS = 1e-2
 
 
 def _normal_means(n: int) -> NDArray[np.float64]:
-    """Means of a standard normal variable over `n` equally likely intervals of its positive half."""
+    """The mean of a standard normal variable in each of `n` equally likely intervals of its positive half: (n,)."""
     normal = NormalDist()
     densities = [normal.pdf(normal.inv_cdf(0.5 + 0.5 * k / n)) for k in range(n)] + [0.0]
     return -2.0 * n * np.diff(densities)
 
 
-# The values of a normal variable for the noise floor: their mean magnitude is exactly that of the variable.
+# Values that stand for a standard normal variable in the noise floor; their mean magnitude is exact.
 _NORMAL = _normal_means(16)
 
 FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")
 
 
 def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
-    """All figures of one material; `error` is the reference's standard error per bin.
+    """All figures of one material, by their names in `FIGURES`; `error` is the reference's standard error per bin.
 
     log_loss: eq. 7. ae: |a - b|. smape: 2 |a - b| / (|a| + |b| + EPS). mape: |a - b| / (b + EPS). mrse: (a - b)^2 /
     (b^2 + EPS). psnr: 10 log10(peak^2 / mean (a - b)^2) dB, peak the reference's brightest bin. albedo_error: mean over
@@ -49,7 +49,7 @@ def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
 
 
 def value_metrics(a: NDArray, b: NDArray) -> dict[str, float]:
-    """The figures that make sense of any values of f cos(theta_o), not only of bins: log_loss, ae and smape."""
+    """The figures that need no bins: log_loss, ae and smape of any values of f cos(theta_o)."""
     difference = np.abs(a - b)
     return {
         "log_loss": float(np.mean(np.abs(np.log1p(a) - np.log1p(b)))),
@@ -59,7 +59,7 @@ def value_metrics(a: NDArray, b: NDArray) -> dict[str, float]:
 
 
 def noise_floor(b: NDArray, error: NDArray) -> float:
-    """Mean of E|log(1 + b + e) - log(1 + b)|, e normal with standard deviation `error`."""
+    """The mean over bins of E|log(1 + b + e) - log(1 + b)|, where e is normal with standard deviation `error`."""
     b, error = b.astype(np.float64), error.astype(np.float64)
     base = np.log1p(b)
     total = 0.0
@@ -69,12 +69,12 @@ def noise_floor(b: NDArray, error: NDArray) -> float:
 
 
 def counting_error(b: NDArray, walks: int, solid_angle: float, rows: int) -> NDArray[np.float64]:
-    """Standard error per bin from the number of walks alone, as if every throughput were 1: an upper bound."""
+    """An upper bound of the standard error per bin, from the number of walks, as if every throughput were 1."""
     return np.sqrt(np.maximum(b, 0.0).astype(np.float64) * rows / (walks * solid_angle))
 
 
 def mean_metrics(materials: list[dict[str, float]]) -> dict[str, float]:
-    """Means over materials of each figure."""
+    """The mean of each figure over the materials."""
     return {name: float(np.mean([m[name] for m in materials])) for name in FIGURES}
 
 

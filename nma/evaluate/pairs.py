@@ -1,7 +1,7 @@
-"""How far one source is from another at random pairs of directions: the figures by which single materials are compared.
+"""Compares two sources at random pairs of directions. Figures of single materials are computed this way.
 
-cos(theta_i) and cos(theta_o) are independent and uniform in a range, azimuths are uniform. No bins, so that the figures
-hold for anisotropic sources and between models that were trained on different data.
+cos(theta_i) and cos(theta_o) are independent and uniform in a range; azimuths are uniform. There are no bins, so that
+anisotropic sources, and models trained on different data, can be compared.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COSINES = (0.02, 1.0)
 
 @dataclass(frozen=True)
 class Pairs:
-    """Cosines and azimuths, (n,) each."""
+    """Cosines and azimuths of wi and wo, (n,) each."""
 
     mu_i: NDArray[np.float64]
     phi_i: NDArray[np.float64]
@@ -29,7 +29,7 @@ class Pairs:
 
     @staticmethod
     def draw(count: int = PAIRS, *, seed: int = 0, cosines: tuple[float, float] = COSINES) -> Pairs:
-        """`count` pairs, determined by the seed."""
+        """`count` random pairs, determined by the seed."""
         rng = np.random.default_rng((seed, 0x9A12))
         mu_i, mu_o = rng.uniform(*cosines, (2, count))
         phi_i, phi_o = rng.uniform(0.0, 2.0 * np.pi, (2, count))
@@ -44,6 +44,6 @@ class Pairs:
 
 
 def compare(model: Values, reference: Values, pairs: Pairs | None = None) -> dict[str, float]:
-    """Log loss, AE and SMAPE of f cos(theta_o) (`nma.evaluate.metrics`), means over pairs and RGB."""
+    """Log loss, AE and SMAPE of f cos(theta_o) (`nma.evaluate.metrics`), as means over pairs and RGB."""
     pairs = pairs or Pairs.draw()
     return metrics.value_metrics(pairs.values(model), pairs.values(reference))

@@ -1,4 +1,4 @@
-"""Images on disk: EXR for linear values, PNG for looking at. Files are written whole or not at all."""
+"""Reads and writes image files: EXR for linear values, PNG to look at. A file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nma.errors import NmaError, one_line
 from nma.files import whole, write_bytes
 from nma.images.size import MOST_PIXELS, header_size
 
-# The channels of an image in the order of a pixel's numbers, and those that are its colour.
+# The channels of an image, in the order of a pixel's values, and its colour channels.
 CHANNELS = ("r", "g", "b", "a")
 COLOUR = CHANNELS[:3]
 
@@ -24,10 +24,11 @@ class ImageError(NmaError, ValueError):
 
 
 def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
-    """Check an image: (height, width, 3), finite.
+    """The image as a float32 array, after a check that it is (height, width, 3) and finite.
 
     Raises:
-        ImageError: another shape, NaN or infinity; the message counts them and names the first pixel.
+        ImageError: the shape is wrong, or values are NaN or infinite; the message counts these pixels and names the
+            first.
     """
     array = np.asarray(image, dtype=np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
@@ -42,16 +43,16 @@ def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
 
 
 def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -> NDArray[np.float32]:
-    """Linear sRGB radiance to display values in 0..1.
+    """Converts linear sRGB radiance to display values (..., 3) in 0..1.
 
-    With x = 2^exposure * radiance: values up to `shoulder` stay as they are, values above it approach 1 as
-    s + (1 - s) (1 - exp(-(x - s) / (1 - s))), which has the same slope at s; then the sRGB transfer curve
-    (IEC 61966-2-1). Each channel on its own, so very bright colours turn white. `shoulder` = 1 clips, as metrics want.
+    Let x = 2^exposure * radiance and s = `shoulder`. Values up to s stay as they are. Larger values approach 1 as s +
+    (1 - s) (1 - exp(-(x - s) / (1 - s))), which has the same slope at s. The sRGB transfer curve (IEC 61966-2-1)
+    follows. Each channel is treated alone, so very bright colours turn white. `shoulder` = 1 clips, as metrics need.
 
     Args:
         image: (..., 3) linear sRGB, any value; negative values become 0.
-        exposure: stops, a factor 2^exposure.
-        shoulder: linear value in (0, 1] where compression starts.
+        exposure: in stops: radiance is multiplied by 2^exposure.
+        shoulder: linear value, in (0, 1], where compression starts.
     """
     if not 0.0 < shoulder <= 1.0:
         raise ImageError(f"tonemap: shoulder {shoulder} must lie in (0, 1]")
@@ -65,21 +66,21 @@ def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -
 
 
 def to_8bit(display: ArrayLike) -> NDArray[np.uint8]:
-    """Display values in 0..1 to bytes, rounded."""
+    """Converts display values in 0..1 to bytes, rounded."""
     return (np.clip(np.asarray(display, dtype=np.float32), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def linear(srgb: ArrayLike) -> NDArray[np.float64]:
-    """Display values in 0..1 to light: the inverse of the sRGB transfer curve (IEC 61966-2-1)."""
+    """Converts display values in 0..1 to linear values, by the inverse of the sRGB transfer curve (IEC 61966-2-1)."""
     x = np.asarray(srgb, np.float64)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
 
 
 def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 0.8) -> Path:
-    """Tone-map a linear image (height, width, 3) and write it as an 8-bit sRGB PNG. Bytes are written as they are.
+    """Tone-map a linear image (height, width, 3) and write it as an 8-bit sRGB PNG. Bytes are written unchanged.
 
     Raises:
-        ImageError: a wrong shape, or values that are not finite.
+        ImageError: the shape is wrong, or values are not finite.
     """
     from PIL import Image
 
@@ -94,8 +95,8 @@ def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shou
 def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) -> Path:
     """Write linear values (height, width) or (height, width, channels) as a 32-bit float EXR.
 
-    Three channels are RGB, four RGBA; `channels` names them where they are something else.
-    Values that are not finite are kept: an EXR is also for looking into what went wrong.
+    Three channels are written as RGB and four as RGBA; `channels` gives them other names. Values that are not finite
+    are kept, so that the file can show what went wrong.
     """
     import mitsuba as mi
 
@@ -112,7 +113,10 @@ def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) 
 
 
 def load_bitmap(path: str | Path) -> Any:
-    """The file as Mitsuba's bitmap. Raises `RuntimeError` where Mitsuba cannot decode it, and as `check_size` does."""
+    """The file as a Mitsuba bitmap.
+
+    Raises `RuntimeError` where Mitsuba cannot decode it, and the errors of `check_size`.
+    """
     import mitsuba as mi
 
     check_size(path)
@@ -121,7 +125,7 @@ def load_bitmap(path: str | Path) -> Any:
 
 
 def check_size(path: str | Path) -> None:
-    """Refuses images of too many pixels by their header, before they take memory. Raises `ImageError`."""
+    """Raises `ImageError` for images of too many pixels. It reads only the header, before the image takes memory."""
     try:
         size = header_size(path)
     except OSError as error:
@@ -135,7 +139,7 @@ def check_size(path: str | Path) -> None:
 
 @contextmanager
 def _second_thread() -> Iterator[None]:
-    """Where the process has one core, lends Mitsuba a thread: its EXR files wait for a second one, else forever."""
+    """Gives Dr.Jit a second thread while this context lasts: with one thread, Mitsuba's EXR code would wait forever."""
     import drjit as dr
 
     if dr.thread_count() > 1:
@@ -149,9 +153,10 @@ def _second_thread() -> Iterator[None]:
 
 
 def read_image(path: str | Path) -> NDArray[np.float32]:
-    """Read EXR, HDR or PFM (linear as stored) or PNG and JPEG (sRGB, made linear) as (height, width, 3) float32.
+    """Read an image as linear float32 (height, width, 3): EXR, HDR and PFM as stored, PNG and JPEG converted from sRGB.
 
-    Grey images are repeated over RGB, alpha is dropped. Of an EXR with several layers the first one in colour counts.
+    Grey is copied to all three channels, and alpha is dropped. From an EXR file with several layers, the first layer in
+    colour is read.
 
     Raises:
         ImageError: the file does not exist or cannot be decoded.
@@ -170,7 +175,7 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
 
 
 def coloured_layer(bitmap: Any) -> Any:
-    """The first layer with red, green and blue, else the first one of a picture in grey or XYZ, else the bitmap."""
+    """The bitmap's first RGB layer, or else its first layer in grey or XYZ, or else the bitmap itself."""
     import mitsuba as mi
 
     kinds = mi.Bitmap.PixelFormat

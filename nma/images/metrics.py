@@ -1,6 +1,7 @@
-"""How far a rendered image is from its reference: numbers here, sheets of pictures in `nma.images.sheet`.
+"""Measures the error of a rendered image against a reference. For sheets of pictures see `nma.images.sheet`.
 
-With a the test and b the reference, linear sRGB, means over pixels and channels, fractions rather than percent:
+`a` is the test image and `b` the reference, both linear sRGB. Errors are means over pixels and channels, as fractions,
+not percent:
 
     l1     |a - b|                              l2     (a - b)^2
     mape   |a - b| / (|b| + eps)                smape  2 |a - b| / (|a| + |b| + eps)
@@ -9,8 +10,8 @@ With a the test and b the reference, linear sRGB, means over pixels and channels
     flip_ldr   mean FLIP of Andersson et al. 2020 on display values, 67 pixels per degree (flip-evaluator)
     flip_hdr   mean HDR-FLIP of Andersson et al. 2021 on linear values, ACES, exposures chosen from the reference
 
-Display values are `nma.images.io.tonemap` at `ldr_exposure` with plain clipping. Equal images give ssim 1, all else 0.
-SSIM and FLIP come from the extra `compare`.
+Display values come from `nma.images.io.tonemap` at `ldr_exposure`, with plain clipping. Equal images give ssim 1, and 0
+for every other metric. SSIM and FLIP need the extra `compare`.
 """
 
 from __future__ import annotations
@@ -27,25 +28,25 @@ from nma.images.io import ImageError, as_image, tonemap
 
 Image = NDArray[np.float32]
 EPS = 0.01
-SMALLEST = 11  # pixels across, the window of ssim
+SMALLEST = 11  # pixels; the width of ssim's window
 METRICS = ("l1", "l2", "mape", "smape", "mrse", "ssim", "flip_hdr", "flip_ldr")
 
 
 def compare_images(
     test: ArrayLike, reference: ArrayLike, *, ldr_exposure: float = 0.0, eps: float = EPS
 ) -> dict[str, float]:
-    """All metrics of a test image against its reference.
+    """All metrics of a test image against a reference.
 
     Args:
-        test, reference: (height, width, 3) linear sRGB, the same shape, finite, at least 11 x 11 for ssim's window.
-        ldr_exposure: stops applied before ssim and flip_ldr.
-        eps: regularisation of mape, smape and mrse.
+        test, reference: (height, width, 3) linear sRGB, finite, of equal shape, at least 11 x 11 for ssim's window.
+        ldr_exposure: exposure in stops for ssim and flip_ldr.
+        eps: the eps of mape, smape and mrse.
 
     Returns:
-        One number for each name in `METRICS`, in that order.
+        One value for each name in `METRICS`, in that order.
 
     Raises:
-        ImageError: different shapes, too small an image, NaN or infinity.
+        ImageError: the shapes differ, the images are too small, or values are NaN or infinite.
     """
     a, b = _pair(test, reference)
     check_size((a.shape[1], a.shape[0]))
@@ -57,7 +58,7 @@ def compare_images(
 
 
 def check_size(size: tuple[int, int]) -> None:
-    """Raises `ImageError` for images that are too small to be compared."""
+    """Raises `ImageError` for images that are too small for ssim."""
     if min(size) < SMALLEST:
         raise ImageError(
             f"images of {size[0]} x {size[1]} pixels are too small for ssim; it needs {SMALLEST} x {SMALLEST}"
@@ -78,12 +79,12 @@ def errors(test: ArrayLike, reference: ArrayLike, *, eps: float = EPS) -> dict[s
 
 
 def flip_map(test: ArrayLike, reference: ArrayLike, *, hdr: bool = False, exposure: float = 0.0) -> Image:
-    """FLIP error of each pixel, (height, width) in 0..1.
+    """The FLIP error of each pixel: (height, width) in 0..1.
 
     Args:
         test, reference: (height, width, 3) linear sRGB; negative values count as 0.
-        hdr: HDR-FLIP, the worst over a range of exposures that the reference sets; otherwise LDR-FLIP.
-        exposure: stops, for LDR-FLIP only.
+        hdr: whether to compute HDR-FLIP, the maximum over a range of exposures chosen from the reference, or LDR-FLIP.
+        exposure: in stops, for LDR-FLIP only.
     """
     flip_evaluator = _package("flip_evaluator")
     a, b = _pair(test, reference)
@@ -104,13 +105,14 @@ def difference_image(
 
     Args:
         test, reference: (height, width, 3) linear sRGB.
-        kind: "flip", LDR-FLIP in the colours of magma (black 0, pale yellow 1); "absolute", mean |a - b| over the
-            channels in magma; "signed", mean a - b over the channels, blue where the test is darker, else red.
-        scale: the difference that takes the last colour.
-        exposure: stops, for "flip".
+        kind: "flip" shows LDR-FLIP in the colour map magma (black 0, pale yellow 1). "absolute" shows, in magma, the
+            mean of |a - b| over the channels. "signed" shows the mean of a - b over the channels, blue where the test
+            is darker and red where it is brighter.
+        scale: the difference that gets the last colour of the map.
+        exposure: in stops, for "flip" only.
 
     Raises:
-        ImageError: unknown kind, different shapes, NaN or infinity.
+        ImageError: the kind is unknown, the shapes differ, or values are NaN or infinite.
     """
     from matplotlib import colormaps
 
@@ -135,16 +137,16 @@ def _pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
 
 
 def ensure_packages(ssim: bool = True) -> None:
-    """Raises `MissingDependencyError` unless all that metrics need is there: better before an hour of rendering."""
+    """Raises `MissingDependencyError` if a package that the metrics need is missing. Call it before long renderings."""
     for name in ("flip_evaluator", *(["skimage.metrics"] if ssim else [])):
         _package(name)
 
 
 def _package(name: str) -> Any:
-    """A package of the extra `compare`.
+    """Imports a package of the extra `compare`.
 
     Raises:
-        MissingDependencyError: it is not installed.
+        MissingDependencyError: the package is not installed.
     """
     try:
         return import_module(name)
@@ -162,7 +164,10 @@ def _ssim(a: Image, b: Image) -> float:
 
 
 def _exposures(reference: Image) -> dict[str, float]:
-    """Nothing for ordinary references. For black or flat ones, which end the process in FLIP, one exposure."""
+    """The range of exposures for HDR-FLIP: empty for ordinary references, so that the package chooses it.
+
+    For references that are black or of one colour the package would end the process; they get a single exposure.
+    """
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
     brightest, middle = float(luminance.max()), float(np.median(luminance))
     if brightest > 1e-4 and brightest > 1.001 * middle:

@@ -1,4 +1,4 @@
-"""Contact sheets: a grid of pictures with column headings, row labels, a line or two under each, and a table below."""
+"""Contact sheets: a grid of pictures with column headings, row labels, captions under the pictures, and a table."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ TITLE_SIZE, TEXT_SIZE, CAPTION_SIZE, GAP, MARGIN = 22, 15, 13, 14, 26
 class Row(NamedTuple):
     """One row of a contact sheet.
 
-    `images`: linear float32 (height, width, 3), tone-mapped here, or bytes, shown as they are; one for each column.
-    `label`: the row's name. `captions`: text under each image, lines parted by a newline; may be shorter than `images`.
+    `images`: one for each column, (height, width, 3). Linear float32 is tone-mapped here; bytes are shown as they are.
+    `label`: the row's name. `captions`: text under each image, of one line or more; there may be fewer than images.
     """
 
     label: str
@@ -44,18 +44,19 @@ def contact_sheet(
 
     Args:
         path: the PNG; written atomically.
-        rows: see `Row`; all images of one size.
-        columns: headings, one for each column.
+        rows: see `Row`; all images have the same size.
+        columns: the heading of each column.
         title: a line on top.
-        table: rows of text cells below the pictures; the first row is the heading, the first column is left-aligned.
-        note: a quiet line at the bottom, such as the tone mapping or the machine.
+        table: rows of text cells below the pictures. The first row is the heading; the first column is left-aligned.
+        note: grey text at the bottom, about the tone mapping or the machine for example.
         exposure, shoulder: tone mapping of linear images, see `nma.images.io.tonemap`.
 
     Returns:
         The sheet as (height, width, 3) bytes.
 
     Raises:
-        ImageError: no rows, a row without one image for each column, images of different sizes, NaN or infinity.
+        ImageError: there are no rows, a row does not have one image for each column, images have different sizes, or
+            values are NaN or infinite.
     """
     pictures = [[_display(image, row.label, exposure, shoulder) for image in row.images] for row in rows]
     height, width = _common_size(pictures, columns)
@@ -89,7 +90,7 @@ def contact_sheet(
 
 
 def _label_height(labels: Iterable[str]) -> int:
-    """Room for a line, where one of them is not empty."""
+    """The height of a line of labels, 0 if all labels are empty."""
     return _line(TEXT_SIZE) + 4 if any(labels) else 0
 
 
@@ -119,7 +120,7 @@ def _common_size(pictures: list[list[NDArray[np.uint8]]], columns: Sequence[str]
 
 
 def _cell_width(width: int, rows: Sequence[Row], columns: Sequence[str]) -> int:
-    """Room for a picture, its heading and its caption."""
+    """The width of a column, wide enough for pictures, heading and captions."""
     headings = [_width(name, TEXT_SIZE, bold=True) for name in columns]
     captions = [_width(text, CAPTION_SIZE) for row in rows for text in row.captions]
     return max(width, *headings, *captions)
@@ -128,7 +129,7 @@ def _cell_width(width: int, rows: Sequence[Row], columns: Sequence[str]) -> int:
 def _draw_row(
     sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]], cell: int, label_height: int
 ) -> None:
-    """The row's label, its images side by side, and a caption under each."""
+    """Draws the row's label, its images side by side, and a caption under each."""
     draw = ImageDraw.Draw(sheet)
     _text(draw, (MARGIN, top), row.label, TEXT_SIZE)
     top += label_height
@@ -140,7 +141,7 @@ def _draw_row(
 
 
 def _draw_table(draw: ImageDraw.ImageDraw, top: float, table: Sequence[Sequence[str]]) -> None:
-    """Cells under a bold heading: the first column to the left, numbers to the right of their columns."""
+    """Draws the cells under a bold heading: the first column is aligned left, all other columns right."""
     if not table:
         return
     left, widths = MARGIN, _column_widths(table)
@@ -192,7 +193,7 @@ def _width(text: str, size: int, *, bold: bool = False) -> int:
 
 @lru_cache(maxsize=16)
 def _font(size: int, bold: bool) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which matplotlib brings along on every system."""
+    """DejaVu Sans, from matplotlib's files, so that it is there on every system."""
     import matplotlib
 
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"

@@ -1,4 +1,4 @@
-"""How many pixels an image file claims to have, from its header: a few hundred bytes may claim ten thousand million."""
+"""Reads the size of an image from its header alone: a file of a few hundred bytes may claim 10^10 pixels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-# 16384 x 8192, the largest environment maps there are; 2 GiB as RGBA in floats.
+# 16384 x 8192, the size of the largest common environment maps; 2 GiB as RGBA in 32-bit floats.
 MOST_PIXELS = 1 << 27
 
-_START = 1 << 16  # bytes that hold the header, of whatever format
+_START = 1 << 16  # bytes; enough for the header of every format
 _SIZE = {
     rb"\x89PNG\r\n\x1a\n.{8}(.{4})(.{4})": ">i",
     rb"BM.{16}(.{4})(.{4})": "<i",
@@ -22,7 +22,7 @@ _TGA_END = b"TRUEVISION-XFILE.\0"
 
 
 def header_size(path: str | Path) -> tuple[int, int] | None:
-    """Width and height of an image, without its pixels; None for what no format of Mitsuba's begins like."""
+    """The width and height of an image, without reading its pixels; None for a file in none of Mitsuba's formats."""
     with Path(path).open("rb") as file:
         start = file.read(_START)
         for pattern, kind in _SIZE.items():
@@ -38,20 +38,20 @@ def header_size(path: str | Path) -> tuple[int, int] | None:
 def _numbers(kind: str, first: bytes, second: bytes) -> tuple[int, int]:
     if kind in (">i", "<i"):
         return abs(struct.unpack(kind, first)[0]), abs(struct.unpack(kind, second)[0])
-    # More digits than these are no size, and Python refuses thousands of them.
+    # 12 digits are enough for any size; Python refuses to convert thousands of digits.
     width, height = int(first[:12]), int(second[:12])
     return (width, height) if kind == "width height" else (height, width)
 
 
 def _exr(start: bytes) -> tuple[int, int] | None:
-    """The largest of all parts."""
+    """The size of the largest part of an EXR file."""
     windows = [struct.unpack("<4i", w) for w in _DATA_WINDOW.findall(start)]
     sizes = [(right - left + 1, bottom - top + 1) for left, top, right, bottom in windows]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 
 def _jpeg(file: BinaryIO) -> tuple[int, int] | None:
-    """From the first frame header, behind segments of any length."""
+    """The size in a JPEG file's first frame header, which follows segments of any length."""
     file.seek(2)
     while len(head := file.read(4)) == 4 and head[0] == 0xFF:
         marker, length = struct.unpack(">xBH", head)
@@ -67,7 +67,7 @@ def _jpeg(file: BinaryIO) -> tuple[int, int] | None:
 
 
 def _tga(file: BinaryIO, start: bytes) -> tuple[int, int] | None:
-    """Its name stands at the end of the file."""
+    """The size of a TGA file. The format's signature is at the end of the file."""
     end = file.seek(0, 2)
     file.seek(max(end - len(_TGA_END), 0))
     if len(start) < 18 or file.read() != _TGA_END:

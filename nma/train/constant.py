@@ -1,4 +1,4 @@
-"""The best constant parameters of one plain Principled BRDF for a material: no network, no direction, no blend."""
+"""Fits one Principled BRDF with constant parameters to a material: no network, no dependence on direction, no blend."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ from nma.train.loss import brdf_loss
 from nma.train.recipe import Recipe
 from nma.train.run import record_of
 
-# The paper's 11 numbers and the fake subsurface. `anisotropic` stays 0: tables of isotropic materials do not know it.
+# The paper's 11 parameters and `flatness`, the fake subsurface. `anisotropic` stays 0, because tables of isotropic
+# materials say nothing about it.
 CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
 
-# Many points in few bins: eq. 7 takes the noise of a bin's average for an error, and a fit avoids what is noisy. With 4
-# points per bin, that of a Principled BRDF's own table ended at a log loss of .0023, with 64 at .00015, for a best of
-# .00014. The log loss alone leaves out what is bright and narrow: copper under a blue medium and a smooth coat became
-# 14 % too dark, with this weight of the albedo 1 %, for a log loss of .0172 instead of .0145.
+# Few bins with many points each. Eq. 7 counts the noise of a bin's average as an error, so fits would avoid lobes whose
+# averages are noisy. A Principled BRDF fitted to its own table ended at a log loss of .0023 with 4 points per bin, and
+# at .00015 with 64; the best possible is .00014. The log loss alone neglects bright, narrow lobes: copper under a blue
+# medium and a smooth coat became 14 % too dark. With this weight of the albedo it became 1 % too dark, at a log loss of
+# .0172 instead of .0145.
 CONSTANT = Recipe(
     network="none",
     instances=1,
@@ -46,7 +48,8 @@ CONSTANT = Recipe(
     steps=800,
 )
 
-# Where the fits start, as the problem has many local minima. The table says which base colour.
+# Starting points of the fits; there are several because the loss has many local minima. The base colour comes from the
+# table.
 _GREY = Color(0.5, 0.5, 0.5)
 _STARTS = {
     "diffuse": Principled(_GREY, 0.6, 0.05, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
@@ -56,13 +59,17 @@ _STARTS = {
     "smooth metal": Principled(_GREY, 0.15, 0.95, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
 }
 
-# cos(theta_i) per row of the table that tell which fit is best.
+# Number of cos(theta_i) per row of the table when fits are compared.
 _DIRECTIONS = 16
 
 
 class Constant(NamedTuple):
-    """Plain numbers, their log loss (eq. 7) and all other figures over the whole table, and the numbers as an adapter
-    that looks at nothing. `brightness` is the light they reflect from all directions together over the material's."""
+    """Result of `fit_constant`.
+
+    `principled`: the parameters as floats. `log_loss` (eq. 7) and `figures`: errors over the whole table. `adapter`:
+    the same parameters as an adapter whose network has no inputs. `brightness`: the light that they reflect, over all
+    directions, divided by the light that the material reflects.
+    """
 
     principled: Principled
     log_loss: float
@@ -72,14 +79,14 @@ class Constant(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """How far a fit is from the table, quickly integrated."""
+    """Errors of a fit against the table, from a quick integration."""
 
     log_loss: float
     albedo_error: float
     brightness: float
 
     def score(self, recipe: Recipe) -> float:
-        """What fits are chosen by: the albedo weighs as much as it did in them."""
+        """The fit with the lowest score is chosen. The albedo has the same weight as in the fits' loss."""
         return self.log_loss + recipe.albedo * self.albedo_error**2
 
 
@@ -90,10 +97,10 @@ def fit_constant(
     *,
     progress: Callable[[loop.Run], None] = lambda run: None,
 ) -> Constant:
-    """Fits the isotropic table of one material from several starting points, and keeps the best by log loss and albedo.
+    """Fits the isotropic table of one material from several starting points; returns the best by log loss and albedo.
 
-    `record` says where the table comes from and is stored with the adapter. Equal arguments give equal results on one
-    machine. Raises `TableError` for several materials and for tables of other bins.
+    `record` says where the table comes from and is stored with the adapter. Equal arguments give equal results on the
+    same machine. Raises `TableError` for a table of several materials or of other bins.
     """
     if len(tables.values) != 1:
         raise TableError(f"constant parameters describe one material, the table has {len(tables.values)}")
@@ -135,14 +142,14 @@ def _judge(adapter: Adapter, tables: Tables) -> _Judged:
 
 
 def _starts(tables: Tables) -> NDArray[np.float32]:
-    """Raw numbers (starts, numbers of the target), whose base colour is the table's mean albedo."""
+    """Encoded parameters (starts, outputs) of all starting points. Their base colour is the table's mean albedo."""
     base_color = Color(*np.clip(tables.albedo()[0].mean(axis=0), 0.02, 0.98))
     blends = [Blend((p._replace(base_color=base_color),), (1.0,)) for p in _STARTS.values()]
     return np.array([target.encode(b, CONSTANT_PARAMS) for b in blends], np.float32)
 
 
 def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The sum over all fits, as none knows of the others, and the log loss of the best."""
+    """The sum of the losses of all fits, which are independent of each other, and the log loss of the best fit."""
 
     def one(numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
         return brdf_loss(Brdf(target.decode(list(numbers), 1, CONSTANT_PARAMS)), batch, recipe)
@@ -152,7 +159,7 @@ def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array,
 
 
 def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -> Adapter:
-    """An adapter whose network is its output's bias alone."""
+    """An adapter whose network consists of the output layer's bias alone."""
     size = tables.params.shape[1]
     space = next(s for s in SPACES.values() if s.size == size)
     layers = [(np.zeros((len(raw), 1), np.float32), np.asarray(raw, np.float32))]
@@ -160,7 +167,7 @@ def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -
 
 
 def _plain(adapter: Adapter) -> Principled:
-    """The adapter's only instance, as Python's floats."""
+    """The adapter's only BRDF instance, as Python floats."""
     flat = adapter.numbers(np.zeros((1, adapter.space.size)), [0.5])[0, 0].tolist()
     (p,) = target.from_numbers(flat, CONSTANT_PARAMS).instances
     return p

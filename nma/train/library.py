@@ -1,4 +1,4 @@
-"""Training a library, codes and network at once, and learning the code of one more material."""
+"""Trains a library (codes and network together), and learns the code of another material."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nma.train.loss import bin_means, brdf_of, distance, loss
 from nma.train.recipe import Recipe
 from nma.train.run import adapter_of, initial_layers
 
-# 20 minutes or less on two cores for a hundred materials, tables included.
+# Training takes 20 minutes or less on two cores for a hundred materials, tables included.
 RECIPE = Recipe(
     network="3x32",
     encoding="raw",
@@ -38,14 +38,14 @@ RECIPE = Recipe(
     steps=60_000,
 )
 
-# One code: the network is known, so that a thousand steps do.
+# For learning one code. The network is fixed, so a thousand steps are enough.
 ENCODING = replace(RECIPE, learning_rate=3e-2, average=0.99, steps=1_000)
 
-# Materials whose codes the search for another one starts from, beside the mean of all.
+# The search for a code starts at the codes of this many materials, and at the mean of all codes.
 NEAREST = 3
-# Spread of the codes at the start.
+# Standard deviation of the codes before training.
 _SPREAD = 0.5
-# Batches that codes are compared by.
+# Number of batches on which codes are compared.
 _JUDGED = 8
 
 
@@ -59,13 +59,14 @@ def train_library(
     progress: Callable[[loop.Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Library, loop.Run]:
-    """Learns a code for each of some materials, and the network that they share.
+    """Learns the network of a library, and the code of each of its materials. Returns the library and the run.
 
-    `record` says where the tables come from; it is stored with the weights, and a checkpoint of other data is refused.
+    `record` says where the tables come from and is stored with the weights. A checkpoint with another record is
+    refused.
     """
     if len(names) != len(tables.values) or tables.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
-            f"a library of {len(names)} materials wants as many tables {ISOTROPIC.shape}, got {tables.values.shape}"
+            f"a library of {len(names)} materials needs as many tables {ISOTROPIC.shape}, got {tables.values.shape}"
         )
     rng = np.random.default_rng((recipe.seed, 0xC0DE))
     free = _SPREAD * rng.standard_normal((len(names), LIBRARY.size))
@@ -93,7 +94,7 @@ def train_library(
 class Encoded:
     """The code (32,) of a new material, and its log loss over the bins of the table.
 
-    `nearest` is the material of the library that comes closest to it, `nearest_log_loss` what that one has.
+    `nearest` is the library's material with the lowest log loss on the same table, which is `nearest_log_loss`.
     """
 
     code: NDArray[np.float32]
@@ -109,10 +110,10 @@ def encode(
     recipe: Recipe = ENCODING,
     progress: Callable[[loop.Run], None] | None = None,
 ) -> Encoded:
-    """Learns the code of the one material of `tables`, the network as it is.
+    """Learns the code of the one material in `tables`. The network does not change.
 
-    The search starts at the mean code and at those of the nearest materials, all at once, and keeps the best. Without
-    `progress`, a bar goes along on stderr if that is a terminal.
+    The search runs from the mean code and from the codes of the nearest materials at once, and keeps the best result.
+    Without `progress`, a progress bar is shown on stderr if that is a terminal.
     """
     if tables.values.shape != (1, *ISOTROPIC.shape):
         raise TableError(f"one table {ISOTROPIC.shape} is encoded at a time, got {tables.values.shape}")
@@ -137,43 +138,46 @@ def encode(
 
 
 def code_of(free: Any) -> Any:
-    """Codes from what Adam moves, any real numbers: within the class's range, and hardly changed in its middle."""
+    """Codes from the free variables of the optimisation.
+
+    Free variables are any real numbers. Codes lie within the class's range; near 0 they almost equal the variables.
+    """
     return CODE_BOUND * jnp.tanh(free * (1.0 / CODE_BOUND))
 
 
 def free_of(code: NDArray) -> NDArray:
-    """Inverse of `code_of`, kept off the ends, where nothing moves any more."""
+    """The inverse of `code_of`. Codes are first kept away from the ends of the range, where gradients vanish."""
     return CODE_BOUND * np.arctanh(np.clip(code / CODE_BOUND, -0.99, 0.99))
 
 
 def objective(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The loss of (codes before `code_of`, layers); the batch has the materials' numbers instead of parameters."""
+    """The loss for weights (free variables of the codes, layers). The batch's column holds indices of materials."""
     free, layers = weights
     codes = code_of(free)[batch.columns[0].astype(jnp.int32)]
     return loss(layers, batch._replace(columns=codes.T), recipe)
 
 
 def _held(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The same, with a network that stays as it is."""
+    """As `objective`, without gradients for the network."""
     free, layers = weights
     return objective((free, jax.lax.stop_gradient(layers)), batch, recipe)
 
 
 def _source(tables: Tables, recipe: Recipe) -> Callable[[int], Batch]:
-    """The batch of each step, with the number of each row's material as its only column."""
+    """A function that returns the batch of a step. Its only column is the index of each row's material."""
     pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
     pool.params = np.arange(len(tables.values), dtype=np.float32)[:, None]
     return lambda step: draw(pool, sampler, recipe, step)
 
 
 def _repeated(tables: Tables, count: int) -> Tables:
-    """One material `count` times, without a copy."""
+    """The tables of one material repeated `count` times, without copying them."""
     values = np.broadcast_to(tables.values, (count, *tables.values.shape[1:]))
     return Tables(np.zeros((count, 1)), values, np.repeat(tables.walks, count))
 
 
 def _judge(codes: NDArray, library: Library, tables: Tables, recipe: Recipe) -> NDArray[np.float32]:
-    """The log loss of each code (n,), from the same few bins for all."""
+    """The log loss (n,) of each code, over the same few bins for all codes."""
     source = _source(tables, replace(recipe, seed=recipe.seed + 1))
     batches = Batch(*(np.stack(parts) for parts in zip(*map(source, range(_JUDGED)), strict=True)))
     layers = library.adapter.layers

@@ -1,4 +1,4 @@
-"""The optimisation loop: Adam, schedules, weight averaging, checkpoints that a killed run resumes from."""
+"""The optimisation loop: Adam, schedules, weight averaging, and checkpoints from which an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from nma.train.batches import batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
 
-# What is trained: any tree of arrays, for an adapter `nma.network.Layers`.
+# The arrays to train, in any JAX tree; for an adapter they are `nma.network.Layers`.
 Weights = Any
 # A named tuple of arrays, such as `nma.train.batches.Batch`.
 Batch = Any
-# (weights, batch, recipe) -> (what is minimised, the log loss that is reported).
+# (weights, batch, recipe) -> (the loss to minimise, the log loss to report).
 Objective = Callable[[Weights, Batch, Recipe], tuple[jax.Array, jax.Array]]
 
 # Steps per call of the compiled function.
@@ -37,7 +37,7 @@ _MIN_SCALE = 1e-3
 
 
 class State(NamedTuple):
-    """All that a step changes."""
+    """Everything that a step changes: weights, their moving average, and Adam's state."""
 
     layers: Weights
     averaged: Weights
@@ -46,7 +46,10 @@ class State(NamedTuple):
 
 @dataclass
 class Run:
-    """A run's progress: the steps done, the losses so far (one per step), and the time spent."""
+    """The progress of a training run: steps done, losses so far (one per step), and time spent.
+
+    `scale` multiplies Adam's steps (schedule "plateau"). `record` says where the training data come from.
+    """
 
     state: State
     step: int = 0
@@ -58,7 +61,7 @@ class Run:
 
 
 def start(recipe: Recipe, layers: Weights, record: dict[str, Any] | None = None) -> Run:
-    """A run that has not done any step; `record` says where its data come from."""
+    """A new run, before its first step; `record` says where its data come from."""
     layers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), layers)
     return Run(State(layers, layers, _optimiser(recipe).init(layers)), record=record or {})
 
@@ -73,10 +76,10 @@ def train(
     progress: Callable[[Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> Run:
-    """Continues `run` to the recipe's last step, or until the time budget is spent; returns it.
+    """Continues `run` to the recipe's last step, or until the time budget is spent, and returns `run`.
 
-    `source(step)` gives a step's batch and must depend on nothing but the step. What `objective` returns first is
-    minimised. With `checkpoint`, progress is written there every minute and at the end.
+    `source(step)` returns the batch of a step and must depend on the step alone. The first value that `objective`
+    returns is minimised. With `checkpoint`, the run is saved to that file every minute and at the end.
     """
     saved = began = time.perf_counter()
     before = run.seconds
@@ -107,7 +110,7 @@ def train(
 
 
 def result(run: Run, recipe: Recipe) -> Weights:
-    """The trained weights as NumPy arrays: the averaged ones where the recipe averages."""
+    """The trained weights as NumPy arrays; they are the averaged weights if the recipe averages."""
     return jax.tree.map(np.asarray, run.state.averaged if recipe.average > 0 else run.state.layers)
 
 
@@ -127,7 +130,7 @@ def _optimiser(recipe: Recipe) -> optax.GradientTransformation:
 def _group(
     state: State, group: Batch, scale: float, recipe: Recipe, objective: Objective
 ) -> tuple[State, jax.Array]:
-    """The steps of one group: the new state and (loss, log loss) of each step."""
+    """Does the steps of one group. Returns the new state, and (steps, 2): loss and log loss of each step."""
     optimiser = _optimiser(recipe)
 
     def step(state: State, batch: Batch) -> tuple[State, jax.Array]:
@@ -141,7 +144,7 @@ def _group(
 
 
 def _plateau(run: Run) -> float:
-    """Halves the step where the mean loss of the last window is no better than that of the one before."""
+    """The scale of the next steps: halved when a window's mean loss is not 1 % below that of the window before."""
     window = _PATIENCE * GROUP
     if run.step % window or run.step < 2 * window:
         return run.scale
@@ -150,7 +153,7 @@ def _plateau(run: Run) -> float:
 
 
 def save(run: Run, recipe: Recipe, path: Path) -> None:
-    """Writes a checkpoint, atomically."""
+    """Writes a checkpoint to `path`, atomically."""
     leaves = jax.tree.leaves(run.state)
     arrays: dict[str, Any] = {f"leaf{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
     notes = {
@@ -165,7 +168,10 @@ def save(run: Run, recipe: Recipe, path: Path) -> None:
 
 
 def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] | None = None) -> Run:
-    """The run stored in a checkpoint, or a new one if there is none. Another recipe, or other data, are refused."""
+    """The run stored in the checkpoint at `path`, or a new run if there is no such file.
+
+    Raises `NmaError` if the checkpoint is damaged, or belongs to another recipe or to other data.
+    """
     run = start(recipe, layers, record)
     if not path.exists():
         return run

@@ -1,4 +1,4 @@
-"""A picture of a training run."""
+"""Draws the loss curve of a training run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from nma.files import whole
 
 
 def plot_losses(log_losses: Sequence[float], path: Path, title: str) -> Path:
-    """Plots the log loss (eq. 7) over steps on logarithmic axes, smoothed over a hundredth of the run, as a PNG."""
+    """Writes a PNG of the log loss (eq. 7) over steps, on logarithmic axes, smoothed over a hundredth of the run.
+
+    Returns `path`.
+    """
     from matplotlib.figure import Figure
 
     losses = np.asarray(log_losses)

@@ -1,4 +1,4 @@
-"""What a training run does, as data: stored with the weights, so that the run can be repeated."""
+"""The settings of a training run. They are stored with the weights, so that the run can be repeated."""
 
 from __future__ import annotations
 
@@ -17,24 +17,29 @@ from nma.table.quadrature import FINEST
 class Recipe:
     """Settings of a training run.
 
-    A step looks at `rows` random (material, theta_i) rows and `bins_per_row` bins of each, with one network pass per
-    row, and averages the target over `points` points per bin.
+    A step takes `rows` random rows (material, theta_i) and `bins_per_row` bins of each row. It runs the network once
+    per row, and averages the target over `points` points per bin.
 
-    - `target`: "principled", the paper's 11 numbers per instance; "stretched", one more that stretches the specular
-      lobe along the plane of incidence; "measured", three more that fade it out, and flatten the diffuse lobe; or
-      "anisotropic", the same with lobes that are stretched along the surface's own axes.
+    - `target`: "principled" has the paper's 11 parameters per instance. "stretched" adds one parameter, which stretches
+      the specular lobe along the plane of incidence. "measured" adds three more, which fade out the specular lobe and
+      flatten the diffuse lobe. "anisotropic" has the parameters of "measured", but stretches lobes along the axes of
+      the surface.
     - `grid`: the resolution of the tables.
-    - `bounded`: dim the target where it might reflect more light than it receives; directional ones only.
-    - `points_law`: "crowded" towards the mirror direction (`nma.table.quadrature`), "uniform" over the bin (the paper),
-      or "centre", one point in the middle of the bin (point supervision).
-    - `finest`: microfacet width down to which points crowd.
-    - `bins_law`: "uniform" over the table, or "mirror": half uniform, half near the mirror direction, weighted back.
-    - `loss`: "log" is eq. 7; "huber" is eq. 7 beyond three standard errors of the table's bin and quadratic within, so
-      that noisy bins pull towards their mean rather than their median.
-    - `energy`: adds this much of the linear error to the logarithmic one, so that bright bins count for their energy.
+    - `bounded`: dim the target where it might reflect more light than it receives. Only for directional targets.
+    - `points_law`: how the points of a bin are drawn: "crowded", denser towards the mirror direction
+      (`nma.table.quadrature`); "uniform" over the bin (the paper); or "centre", one point in the middle of the bin
+      (point supervision).
+    - `finest`: smallest microfacet width (alpha) that "crowded" points resolve.
+    - `bins_law`: how bins are chosen: "uniform" over the table, or "mirror", half uniform and half near the mirror
+      direction, with weights that undo the choice.
+    - `loss`: "log" is eq. 7. "huber" is eq. 7 for residuals beyond three standard errors of the table's bin and
+      quadratic for smaller residuals, so that noisy bins are fitted by their mean, not by their median.
+    - `energy`: weight of the linear error, which is added to the logarithmic error so that bright bins count by their
+      energy.
     - `albedo`: weight of the squared error of the directional albedo, from twice `albedo_samples` samples per row.
-    - `schedule`: "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls, "constant" keeps it.
-    - `average`: decay of the exponential moving average of the weights; 0 means none.
+    - `schedule`: of the learning rate. "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls,
+      and "constant" keeps it.
+    - `average`: decay of the exponential moving average of the weights; 0 means no averaging.
     """
 
     network: str = "5x64"
@@ -75,16 +80,18 @@ class Recipe:
                 raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
         if self.target in ("stretched", "measured") and not self.directional:
             raise NmaError(
-                "a target stretched in the plane of incidence follows the direction; use principled"
+                "a target stretched along the plane of incidence depends on the direction; use principled"
             )
         if bool(self.grid.phi_i) != (self.target == "anisotropic"):
-            raise NmaError("anisotropic tables and an anisotropic target belong together")
+            raise NmaError(
+                "an anisotropic target needs anisotropic tables, and the other way round; set both, or neither"
+            )
         if not 0 <= self.average < 1:
             raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
 
     @property
     def bounds_energy(self) -> bool:
-        """Whether the target is dimmed: constant parameters stay reciprocal instead."""
+        """Whether the target is dimmed. With constant parameters it is not, so that it stays reciprocal."""
         return self.bounded and self.directional
 
     @property
@@ -110,7 +117,7 @@ PAPER = Recipe(
     average=0.0,
 )
 
-# One material: a small network that sees the direction alone.
+# One material: a small network with the direction as its only input.
 SINGLE = Recipe(
     network="3x32",
     encoding="direction",
@@ -125,11 +132,11 @@ SINGLE = Recipe(
     steps=6_000,
 )
 
-# One material that has values without noise: measured, tabulated, or somebody else's BSDF.
+# One material with values free of noise: measured, tabulated, or a BSDF of another program.
 MEASURED = replace(
     SINGLE,
     target="measured",
-    # The bound knows nothing of the fade, and would dim what is bright and fades.
+    # The bound does not include the fade, so it would dim bright lobes that fade out.
     bounded=False,
     rows=512,
     bins_per_row=64,
@@ -143,7 +150,7 @@ MEASURED = replace(
     average=0.0,
     steps=16_000,
 )
-# The same where it matters how the material is turned.
+# The same for an anisotropic material.
 ANISOTROPIC = replace(
     MEASURED, encoding="azimuth", target="anisotropic", grid=Grid(theta_i=20, theta_o=20, phi_o=40, phi_i=40)
 )
@@ -158,16 +165,17 @@ PRESETS = {
 
 
 def preset(name: str, **changes) -> Recipe:
-    """The preset `name` with some settings changed; `None` leaves a setting as it is."""
+    """The preset `name` with `changes` to some settings; the value `None` leaves a setting unchanged."""
     if name not in PRESETS:
         raise NmaError(f"unknown preset '{name}'; known are {', '.join(PRESETS)}")
     return replace(PRESETS[name], **{k: v for k, v in changes.items() if v is not None})
 
 
 def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
-    """The preset `name` for a class, as `preset` with `changes`.
+    """The preset `name` for a class, with `changes` as for `preset`.
 
-    An encoding that is named after another class becomes the encoding of this class, or `raw` if it has none.
+    Some encodings are named after a class. The preset's encoding is then replaced by the encoding of this class, or by
+    `raw` if this class has no encoding.
     """
     recipe = preset(name, **changes)
     if recipe.encoding not in SPACES:
