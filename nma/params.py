@@ -16,8 +16,8 @@ Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
 Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
 Range = Literal["training", "valid"]
 
-# How far beyond a bound a number may lie, in the unit of the parameter or, if that is less, of its range. Textures, and
-# renderers in other languages, keep numbers in single precision: that moves the bounds of our classes by up to 2.4e-7.
+# How far beyond a bound a number may lie; where a range is narrower than 1, this share of it. The reason is rounding:
+# textures and other languages keep numbers in single precision, which moves the bounds of our classes by up to 1e-7.
 ROUNDING = 1e-6
 # What to do about a number beyond a range.
 _ADVICE = {
@@ -27,7 +27,7 @@ _ADVICE = {
 
 
 class Bounds(NamedTuple):
-    """The numbers from `low` to `high`: which they are, and what to say of others. All that is checked is checked here.
+    """The numbers from `low` to `high`. Every check of a parameter asks `bad`, and says what `refusal` returns.
 
     Numbers are arrays of NumPy or Dr.Jit. The bounds may be arrays, too, one number per column.
     """
@@ -36,7 +36,7 @@ class Bounds(NamedTuple):
     high: Any
 
     def bad(self, x: Any, clamp: bool = False) -> Any:
-        """Which numbers are refused: all beyond by more than rounding or, as `clamp` moves these, NaN and infinity."""
+        """Which numbers are refused: those beyond by more than `ROUNDING`; with `clamp` only NaN and infinity."""
         finite = abs(x) < np.inf
         if clamp:
             return ~finite
@@ -44,11 +44,11 @@ class Bounds(NamedTuple):
         return ~(finite & (x >= self.low - slack) & (x <= self.high + slack))
 
     def moved(self, x: Any) -> Any:
-        """The nearest numbers within; the lower bound for NaN. On a bound the derivative is 1: values may come back."""
+        """The nearest numbers within the bounds; for NaN the lower bound. On a bound the derivative is 1, not 0."""
         return ops.select(x >= self.low, ops.select(x <= self.high, x, self.high), self.low)
 
     def refusal(self, name: str, found: ArrayLike, kind: Range = "valid") -> str:
-        """What to say of a bad value: of a number, or of a triple, which is shortened where it is grey."""
+        """The message for a bad number or triple `found`. A grey triple is shown as one number."""
         numbers = [f"{x:.7g}" for x in np.ravel(np.asarray(found, np.float64))]
         shown = ", ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
         return f"{name} is {shown}, allowed is {self.low:g} .. {self.high:g}{_ADVICE[kind]}"
