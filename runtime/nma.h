@@ -6,10 +6,23 @@
 //     const nma::Value v = brdf.eval_pdf(wi, wo);                        // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = brdf.sample(wi, u_lobe, u1, u2);
 //
-// C++17, no dependencies. The network runs on the widest vectors of the CPU at hand (`InstructionSet`). Loading and
-// making `Curves` allocate and throw `nma::Error`; everything else does neither and is safe to call from many threads
-// at once. Directions are unit vectors in the local frame, z up, `wi` towards the viewer, `wo` towards the light. Lobes
-// of adapters with `in_plane` parameters are stretched along the plane of incidence, which is found here.
+// C++17, no dependencies. The network runs on the widest vectors of the CPU (`InstructionSet`). Loading an adapter and
+// making `Curves` allocate memory and throw `nma::Error`. Everything else does neither, and many threads may call it at
+// once. Directions are unit vectors in the local frame, z up: `wi` points towards the viewer, `wo` towards the light.
+//
+// Where things are, in the order in which a query meets them:
+//
+//     nma.h              Adapter, Brdf, Curves, and the functions ..._many
+//     nma/weights.h      Weights: the weights file, read and checked; nma/json.h reads its JSON
+//     nma/encoding.h     Encoding: from parameters and `wi` to the inputs of the network
+//     nma/network.h      Network: the weights in the order in which kernels read them; nma/kernels/layout.h shows it
+//     nma/kernels.h      Kernels: the functions of each instruction set; their code is in nma/kernels/
+//     nma/preparation.h  Preparation: all that these functions read; `assemble`, which fills in a blend
+//     nma/blend.h        Blend: value, density and sample of all lobes; nma/lanes.h computes four instances at once
+//     nma/target.h       Principled: one instance; Plane: the plane of incidence. Generated from Python
+//     nma/classes.h      the parameters of each class, generated; nma/constants.h: constants shared with Python
+//     nma/layered.h      the simulated layered material, which no adapter needs
+//     nma/error.h        Error
 #pragma once
 
 #include <cstddef>
@@ -24,22 +37,24 @@ using Direction = Vec3<float>;
 using Value = Evaluation<float>;
 using Sampled = Sample<float>;
 
-// The BRDF at one shading point, for the cos(theta_i), of anisotropic adapters the `wi`, that it was prepared for.
+// The BRDF at one shading point. It holds for the cos(theta_i) that it was prepared for. If the adapter is anisotropic,
+// it holds for that `wi` only.
 class Brdf {
 public:
-    // f cos(theta_o) [1/sr], 0 below the horizon.
+    // The value f cos(theta_o) [1/sr], 0 below the horizon.
     Vec3<float> eval(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).value; }
 
     // The density of `sample` [1/sr], 0 below the horizon.
     float pdf(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).pdf; }
 
-    // Both at the price of one.
+    // The value and the density together, which take no longer than either.
     Value eval_pdf(const Direction& wi, const Direction& wo) const {
         const Plane<float> plane = frame(wi);
         return nma::eval_pdf(blend_, plane_enter<float>(plane, wi), plane_enter<float>(plane, wo));
     }
 
-    // A direction from three uniform numbers in [0, 1), with its value and density; pdf == 0 marks an invalid one.
+    // A direction from three uniform numbers in [0, 1), with its value and its density. A density of 0 marks an invalid
+    // direction.
     Sampled sample(const Direction& wi, float u_lobe, float u1, float u2) const {
         const Plane<float> plane = frame(wi);
         Sampled found = nma::sample(blend_, plane_enter<float>(plane, wi), u_lobe, u1, u2);
@@ -47,8 +62,8 @@ public:
         return found;
     }
 
-    // The directional albedo at `wi`, at most 1, which denoisers ask for: the mean over samples at fixed points
-    // (Roberts 2018, "R2").
+    // The directional albedo at `wi`, at most 1, as RGB. Denoisers ask for it. It is the mean of value / pdf over
+    // samples at fixed points (Roberts 2018, "R2").
     Vec3<float> albedo(const Direction& wi, int points = 128) const {
         const auto fraction = [](float x) { return x - std::floor(x); };
         Vec3<float> sum{0.0f, 0.0f, 0.0f};
@@ -68,28 +83,30 @@ private:
     friend class Adapter;
     friend class Curves;
 
-    // Found anew at each call: a BRDF that was prepared for a cosine alone serves all azimuths.
+    // The frame in which the blend holds. Lobes that were trained in the plane of incidence stretch along that plane.
+    // Each call finds the plane again, because a BRDF that was prepared for a cosine serves all azimuths.
     Plane<float> frame(const Direction& wi) const { return in_plane_ ? plane_of<float>(wi) : Plane<float>{1.0f, 0.0f}; }
 
     Blend<float> blend_;
     bool in_plane_ = false;
 };
 
-// What `Brdf` was called before.
+// The former name of `Brdf`.
 using Material = Brdf;
 
 // How a weights file is loaded.
 struct Options {
-    // All but avx512_bf16 compute in float32; that one halves a network's time by rounding activations to 8 bits.
+    // If this CPU lacks the instruction set, `portable` runs instead. avx512_bf16 rounds weights and activations to
+    // bfloat16, which keeps 8 significant bits, and takes half the time for a network. The others compute in float32.
     InstructionSet set = fastest();
-    // Rounds weights to bfloat16, which halves the memory that a query has to fetch. Both shipped adapters lost less
-    // than .00002 of log loss by it; avx512_bf16 always does it.
+    // Rounds weights to bfloat16, which halves the memory that a query has to fetch. It raised the log loss of both
+    // shipped adapters by less than .00002. avx512_bf16 rounds weights whatever this says.
     bool compact = false;
 };
 
 class Adapter {
 public:
-    // Queries that `prepare_many` works on at once.
+    // The count of queries that `prepare_many` works on at once.
     static constexpr int BLOCK = 24;
 
     static Adapter load(const std::string& path, const Options& options = {}) {
@@ -105,46 +122,50 @@ public:
         return Adapter(parse_weights(bytes, size), options);
     }
 
-    // Numbers that `prepare` takes, in the order of `parameters`.
-    int parameter_count() const { return recipe_.encoding.parameters(); }
+    // The count of numbers that `prepare` reads, in the order of `parameters`. A colour has three.
+    int parameter_count() const { return preparation_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
-    // The parameters of the only material that it knows, which `prepare` does not read; empty where it knows a class.
+    // The numbers of the material that the adapter was fitted to, if it was fitted to one. `prepare` then reads no
+    // parameters. Empty if the adapter was trained on a class.
     const std::vector<float>& material() const { return weights_.material; }
-    // The number of the first of them that is not finite or beyond its training range, where the network makes up
-    // plausible values, or, if it knows a single material, not of that; -1 if there is none. `parameter` says whose
-    // number it is.
+    // The index of the first number that is not allowed, or -1. A number is allowed if it is finite and lies in its
+    // training range; beyond that range the network makes up plausible values. If the adapter was fitted to a single
+    // material, only the numbers of that material are allowed. `parameter` returns the parameter of an index.
     int check(const float* parameters) const {
         for (int k = 0; k < parameter_count(); ++k)
-            if (!knows(k, parameters[k])) return k;
+            if (!allowed(k, parameters[k])) return k;
         return -1;
     }
-    // Moves each into its training range, NaN to the lower end. Where it knows a single material, nothing moves.
+    // Moves each number into its training range, and NaN to the lower end. Does nothing if the adapter was fitted to a
+    // single material.
     void clamp(float* parameters) const {
         if (!material().empty()) return;
         for (int k = 0; k < parameter_count(); ++k) parameters[k] = parameter(k).clamped(parameters[k]);
     }
-    const SourceParam& parameter(int number) const { return weights_.parameters[owners_[number]]; }
+    // The parameter that the number of this index belongs to.
+    const SourceParam& parameter(int index) const { return weights_.parameters[owners_[index]]; }
 
-    // Numbers that describe a blend, and what the network returns for them.
-    int output_count() const { return recipe_.outputs; }
+    // The count of numbers that the network returns for a query. They describe a blend.
+    int output_count() const { return preparation_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
-    // Whether the view's azimuth matters; where it does not, of `wi` only wi.z does. A cosine c in place of `wi` stands
-    // for the azimuth 0: wi = (sqrt(1 - c^2), 0, c).
-    bool anisotropic() const { return recipe_.encoding.anisotropic(); }
+    // Whether the azimuth of `wi` matters. If not, `prepare` reads wi.z alone. Functions that take a cosine c instead
+    // of `wi` use the azimuth 0, which is wi = (sqrt(1 - c^2), 0, c).
+    bool anisotropic() const { return preparation_.encoding.anisotropic(); }
 
-    // The BRDF for the parameters of the source material, seen from `wi`.
+    // The BRDF for the parameters of a source material, seen from `wi`, which has z in (0, 1].
     Brdf prepare(const float* parameters, const Direction& wi) const {
         Brdf made;
         made.in_plane_ = in_plane_;
-        kernels().prepare(recipe_, parameters, wi, made.blend_);
+        kernels().prepare(preparation_, parameters, wi, made.blend_);
         return made;
     }
     Brdf prepare(const float* parameters, float cos_theta_i) const {
         return prepare(parameters, at_azimuth_0(cos_theta_i));
     }
 
-    // The same for many shading points, whose parameters are rows: queries share the loads of the weights.
+    // Prepares many shading points, and loads the weights once for several of them. `parameters` has a row for each
+    // shading point, `parameter_count` numbers long.
     void prepare_many(int count, const float* parameters, const Direction* wi, Brdf* brdfs) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
@@ -153,9 +174,9 @@ public:
             for (int q = 0; q < now; ++q) {
                 Brdf& made = brdfs[first + q];
                 made.in_plane_ = in_plane_;
-                kernels().decode(recipe_, outputs + q * network_.output_stride(), wi[first + q].z, made.blend_);
+                kernels().decode(preparation_, outputs + q * network_.output_stride(), wi[first + q].z, made.blend_);
             }
-            for (int q = first; q < first + now; ++q) kernels().odds(recipe_, wi[q].z, brdfs[q].blend_);
+            for (int q = first; q < first + now; ++q) kernels().odds(preparation_, wi[q].z, brdfs[q].blend_);
         }
     }
     void prepare_many(int count, const float* parameters, const float* cos_theta_i, Brdf* brdfs) const {
@@ -164,17 +185,18 @@ public:
         });
     }
 
-    // What the network returns, before decoding; `raw` is aligned to 64 bytes and has room for WIDEST_LAYER numbers.
+    // The outputs of the network before decoding. `raw` must be aligned to 64 bytes and have room for WIDEST_LAYER
+    // numbers.
     void network_outputs(const float* parameters, const Direction& wi, float* raw) const {
         alignas(64) float inputs[WIDEST_LAYER];
-        kernels().encode(recipe_, parameters, wi, inputs);
+        kernels().encode(preparation_, parameters, wi, inputs);
         network_.forward(inputs, raw);
     }
     void network_outputs(const float* parameters, float cos_theta_i, float* raw) const {
         network_outputs(parameters, at_azimuth_0(cos_theta_i), raw);
     }
 
-    // Likewise for many, rows of `output_count` numbers.
+    // The outputs of the network for many queries: rows of `output_count` numbers, without alignment.
     void network_outputs_many(int count, const float* parameters, const Direction* wi, float* raw) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
@@ -195,40 +217,47 @@ public:
 private:
     friend class Curves;
 
+    // The order matters: each step reads what the steps before it wrote.
     Adapter(Weights weights, const Options& options) : weights_(std::move(weights)) {
+        // The counts of inputs and outputs that the description asks for.
         for (const TargetParam& p : weights_.target) add_fields(p);
         for (std::size_t k = 0; k < weights_.parameters.size(); ++k)
             owners_.insert(owners_.end(), weights_.parameters[k].size, k);
-        recipe_.encoding = Encoding(weights_);
-        recipe_.instances = weights_.instances;
-        recipe_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
-        recipe_.bounded = weights_.bounded;
-        check();
-        weights_.layers.front() = recipe_.encoding.arranged(weights_.layers.front());
+        preparation_.encoding = Encoding(weights_);
+        preparation_.instances = weights_.instances;
+        preparation_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
+        preparation_.bounded = weights_.bounded;
+        // `check_description` compares these counts with the layers, so it needs the layers as the file has them.
+        check_description();
+        // From here on the first layer differs from the file: its inputs are in the order in which `encode` writes
+        // them.
+        weights_.layers.front() = preparation_.encoding.arranged(weights_.layers.front());
         network_ = Network(weights_.layers, options.set, options.compact);
-        recipe_.network = network_.view();
+        preparation_.network = network_.view();
+        // Both use the padded output width, which the network has chosen.
         lay_out_ranges();
         lay_out_lanes();
+        // The network has copied the weights.
         weights_.layers.clear();
     }
 
     const Kernels& kernels() const { return network_.kernels_in_use(); }
 
-    // Whether a material may have x for its parameter number `k`.
-    bool knows(int k, float x) const {
+    // Whether x is allowed as number `k` of the parameters: see `check`.
+    bool allowed(int k, float x) const {
         if (material().empty()) return parameter(k).allows(x);
         return same(x, material()[k]);
     }
 
-    // Remembers which fields of a `Principled` the numbers of a parameter become.
+    // Appends the places in `Principled` that the numbers of a target parameter go to, counted in numbers.
     void add_fields(const TargetParam& p) {
         in_plane_ |= p.in_plane;
         const int first = static_cast<int>(detail::field(p.name, p.size).first);
         for (int c = 0; c < p.size; ++c) fields_.push_back(first + c);
     }
 
-    // Refuses a network that does not fit its own description, or this version's target.
-    void check() const {
+    // Throws if the network does not fit its description, or if this version cannot evaluate its target.
+    void check_description() const {
         if (anisotropic() && (in_plane_ || !weights_.directional))
             throw Error(
                 "anisotropic, but its target holds in the plane of incidence, or ignores the direction; train again");
@@ -236,17 +265,18 @@ private:
             throw Error("written for the Principled dialect '" + weights_.dialect + "', not '" + DIALECT + "'");
         if (weights_.instances > MAX_INSTANCES)
             throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
-        if (weights_.layers.front().in != recipe_.encoding.size() || weights_.layers.back().out != output_count())
+        if (weights_.layers.front().in != preparation_.encoding.size() || weights_.layers.back().out != output_count())
             throw Error("the network does not fit its description; train again");
     }
 
-    // The ranges of all outputs, of instance after instance; shares of the blend lie in 0 .. 1.
+    // Fills in the ranges of all outputs: those of the first instance, of the second, and so on, and then the shares of
+    // the blend, which lie in 0 .. 1. The padding keeps its zeros.
     void lay_out_ranges() {
         const int count = network_.output_stride();
         ranges_ = detail::aligned<float>(5 * static_cast<std::size_t>(count));
         float *start = ranges_.get(), *slope = start + count, *factor = slope + count;
         float *rate = factor + count, *in_plane = rate + count;
-        recipe_.ranges = {count, 0, start, slope, factor, rate, in_plane};
+        preparation_.ranges = {count, 0, start, slope, factor, rate, in_plane};
         int next = 0;
         for (int k = 0; k < weights_.instances; ++k)
             for (const TargetParam& p : weights_.target)
@@ -255,25 +285,29 @@ private:
                     (p.logarithmic ? factor : start)[next] = static_cast<float>(p.low);
                     (p.logarithmic ? rate : slope)[next] =
                         static_cast<float>(p.logarithmic ? std::log2(p.high / p.low) : p.high - p.low);
-                    if (p.logarithmic) recipe_.ranges.logarithmic = next + 1;
+                    if (p.logarithmic) preparation_.ranges.logarithmic = next + 1;
                 }
         std::fill(slope + next, slope + output_count(), 1.0f);
     }
 
+    // Fills in `Preparation::lanes`. Fields that the network does not set, and lanes without an instance, get the index
+    // of the first output of padding. It exists because `Network` pads the last layer by at least one neuron, and its
+    // decoded value is 0 because its weights and its range are 0.
     void lay_out_lanes() {
         const int size = static_cast<int>(fields_.size()), per_pack = Blend<float>::FIELDS * LANES;
-        lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, output_count());
+        const int zero = output_count();
+        lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, zero);
         for (int k = 0; k < weights_.instances; ++k)
             for (int f = 0; f < size; ++f) lanes_[k / LANES * per_pack + fields_[f] * LANES + k % LANES] = k * size + f;
-        recipe_.lanes = lanes_.data();
+        preparation_.lanes = lanes_.data();
     }
 
-    // Isotropic adapters do not look at what would cost them a root.
+    // A direction with this cosine. Isotropic adapters read only z, so x is not worth a square root for them.
     Direction at_azimuth_0(float cos_theta_i) const {
         return {anisotropic() ? safe_sqrt(1.0f - cos_theta_i * cos_theta_i) : 0.0f, 0.0f, cos_theta_i};
     }
 
-    // Calls `work(first, count, wi)` for blocks of queries, whose first is the number `first` of all.
+    // Calls `work(first, count, wi)` for each block of queries. `first` is the index of the block's first query.
     template <class Work>
     void in_blocks(int count, const float* cos_theta_i, const Work& work) const {
         Direction wi[BLOCK];
@@ -285,32 +319,34 @@ private:
         }
     }
 
-    // The parameters of query `q`.
+    // The parameters of the query with index `q`.
     const float* row(const float* parameters, int q) const {
         return parameters + static_cast<std::size_t>(q) * parameter_count();
     }
 
+    // Runs the network for at most BLOCK queries.
     void outputs_of_block(int count, const float* parameters, const Direction* wi, float* outputs) const {
         alignas(64) float inputs[BLOCK * WIDEST_LAYER];
         for (int q = 0; q < count; ++q)
-            kernels().encode(recipe_, row(parameters, q), wi[q], inputs + q * network_.input_stride());
+            kernels().encode(preparation_, row(parameters, q), wi[q], inputs + q * network_.input_stride());
         network_.forward_many(count, inputs, outputs);
     }
 
     Weights weights_;
     Network network_;
-    Recipe recipe_{};
-    std::vector<int> fields_, lanes_;
-    std::vector<std::size_t> owners_;
+    Preparation preparation_{};
+    std::vector<int> fields_;          // for each number of an instance: its place in `Principled`
+    std::vector<int> lanes_;           // `Preparation::lanes`
+    std::vector<std::size_t> owners_;  // for each number of the parameters: the index of its parameter
     std::unique_ptr<float[], detail::FreeAligned> ranges_;
     bool in_plane_ = false;
 };
 
-// The blends of an untextured material over cos(theta_i), interpolated between nodes: no network at the shading point.
-// Of isotropic adapters only.
+// The blends of an untextured material at many values of cos(theta_i), and the interpolation between them. The network
+// does not run at the shading point. Isotropic adapters only.
 class Curves {
 public:
-    // As many as nma/render/curves.py has, and the cosine that it takes for those below.
+    // The same constants as in nma/render/curves.py. The first node has the cosine MIN_COS instead of 0.
     static constexpr int NODES = 128;
     static constexpr float MIN_COS = 1e-4f;
 
@@ -325,7 +361,8 @@ public:
         }
     }
 
-    // Weights and odds of both neighbours sum to one, and so do those between them.
+    // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of both nodes sum to 1, so the
+    // interpolated weights do. The same holds for the odds.
     Brdf at(float cos_theta_i) const {
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
@@ -350,7 +387,7 @@ private:
     std::vector<Brdf> nodes_;
 };
 
-// Batches of `Brdf::eval_pdf` and `Brdf::sample`; `u` holds three uniform numbers for each.
+// Calls `Brdf::eval_pdf` or `Brdf::sample` for many shading points. `u` has three uniform numbers for each.
 inline void eval_pdf_many(int count, const Brdf* brdfs, const Direction* wi, const Direction* wo, Value* values) {
     for (int k = 0; k < count; ++k) values[k] = brdfs[k].eval_pdf(wi[k], wo[k]);
 }

@@ -6,20 +6,15 @@
 #include <cstdint>
 #include <locale>
 #include <sstream>
-#include <stdexcept>
 #include <string>
 #include <string_view>
 #include <utility>
 #include <vector>
 
 #include "constants.h"
+#include "error.h"
 
 namespace nma {
-
-// What is wrong with a file, where, and what to do about it.
-struct Error : std::runtime_error {
-    using std::runtime_error::runtime_error;
-};
 
 struct Json {
     enum class Kind { Null, Boolean, Number, String, Array, Object };

@@ -1,8 +1,9 @@
 // `Adapter::prepare` for each instruction set, chosen at run time: one binary serves all CPUs.
 //
-// Every instruction set compiles the same code, kernels/body.inl, over its own vector type; avx512_bf16 has a product
-// of its own, which rounds weights and activations to bfloat16. For compilers that fail on it (clang 16 does at -O1),
-// the macro NMA_NO_AVX512_BF16 leaves it out; NMA_PORTABLE_ONLY leaves out all but portable code.
+// Each instruction set compiles the same code, kernels/body.inl, for its own vector type. avx512_bf16 alone runs the
+// network with its own code, which rounds weights and activations to bfloat16. Some compilers fail on that code (clang
+// 16 does at -O1): the macro NMA_NO_AVX512_BF16 leaves it out. The macro NMA_PORTABLE_ONLY leaves out everything except
+// the portable code.
 #pragma once
 
 #include <cstdint>
@@ -26,7 +27,7 @@
 
 namespace nma {
 
-// In the order of their speed.
+// The slowest comes first.
 enum class InstructionSet { portable, neon, avx2, avx512, avx512_bf16 };
 
 constexpr InstructionSet INSTRUCTION_SETS[] = {InstructionSet::portable, InstructionSet::neon, InstructionSet::avx2,
@@ -41,7 +42,8 @@ namespace detail {
 
 #ifdef NMA_X86
 #if defined(_MSC_VER)
-// What CPU and operating system have, by the bits of leaves 1 and 7 and of the extended control register.
+// Whether the CPU and the operating system support `set`. The answer is in leaves 1 and 7 of CPUID and in the extended
+// control register.
 inline bool cpu_has(InstructionSet set) {
     int leaf1[4], leaf7[4], leaf7_1[4];
     __cpuid(leaf1, 1);
@@ -68,7 +70,7 @@ inline bool cpu_has(InstructionSet set) {
 
 }  // namespace detail
 
-// Whether this program, on this CPU, can run it.
+// Whether this program can run `set` on this CPU.
 inline bool supported(InstructionSet set) {
     if (set == InstructionSet::portable) return true;
 #if defined(NMA_X86)
@@ -83,31 +85,34 @@ inline bool supported(InstructionSet set) {
 #endif
 }
 
-// The fastest one here that computes in float32.
+// The fastest supported instruction set that computes in float32.
 inline InstructionSet fastest() {
     for (const auto set : {InstructionSet::avx512, InstructionSet::avx2, InstructionSet::neon})
         if (supported(set)) return set;
     return InstructionSet::portable;
 }
 
-// The functions of an instruction set.
+// The functions for one instruction set. A row of inputs has the padded input count of the first layer, with zeros at
+// the end. A row of outputs has the padded width of the last layer, and is aligned to 64 bytes.
 struct Kernels {
     InstructionSet set;
-    // One query: `inputs` padded with zeros to a multiple of INPUT_STEP, room for the last layer's width in `outputs`.
+    // Runs the network for one query.
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
-    // Many: rows of `inputs` padded likewise, rows of the last layer's width in `outputs`.
+    // Runs the network for many queries, a row each.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
-    // What comes before the network and after it, `raw` aligned to 64 bytes. CPUs that run their widest vectors on
-    // fewer units run `odds`, whose vectors are narrow, at half its speed among them: batches keep the two apart.
-    void (*encode)(const Recipe&, const float* parameters, const Vec3<float>& wi, float* inputs);
-    void (*decode)(const Recipe&, float* raw, float cosine, Blend<float>&);
-    void (*odds)(const Recipe&, float cosine, Blend<float>&);
-    // All of it for one query.
-    void (*prepare)(const Recipe&, const float* parameters, const Vec3<float>& wi, Blend<float>&);
+    // `encode` fills in a row of inputs. `decode` makes a blend of a row of outputs `raw`, which it overwrites. `odds`
+    // then fills in the odds of the blend. `odds` is apart from `decode`, because its vectors are narrow: some CPUs
+    // have fewer units for their widest vectors, and run narrow vectors among wide ones at half the speed. Batches call
+    // `decode` for all queries first, then `odds`.
+    void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
+    void (*decode)(const Preparation&, float* raw, float cosine, Blend<float>&);
+    void (*odds)(const Preparation&, float cosine, Blend<float>&);
+    // All steps for one query.
+    void (*prepare)(const Preparation&, const float* parameters, const Vec3<float>& wi, Blend<float>&);
 };
 
-// Those of `set`; the portable ones if it cannot run here.
+// The kernels of `set`, or the portable kernels if `set` cannot run here.
 inline const Kernels& kernels(InstructionSet set) {
     static constexpr Kernels PORTABLE{InstructionSet::portable,
                                       portable::forward,
@@ -120,7 +125,7 @@ inline const Kernels& kernels(InstructionSet set) {
 #if defined(NMA_X86)
     static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many,          avx2::encode,
                                   avx2::decode,         avx2::odds,    avx2::prepare<avx2::forward>};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_narrow, avx512::forward_many,
+    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_either, avx512::forward_many,
                                     avx512::encode,         avx512::decode,         avx512::odds,
                                     avx512::prepare_either};
 #if !defined(NMA_NO_AVX512_BF16)

@@ -16,7 +16,7 @@ struct FreeAligned {
     void operator()(void* memory) const { ::operator delete(memory, std::align_val_t(64)); }
 };
 
-// Numbers on a boundary of 64 bytes, as vector loads want them, all 0 at first.
+// An array of zeros on a boundary of 64 bytes, which the widest vector loads need.
 template <class T>
 std::unique_ptr<T[], FreeAligned> aligned(std::size_t count) {
     T* memory = static_cast<T*>(::operator new(count * sizeof(T), std::align_val_t(64)));
@@ -24,18 +24,20 @@ std::unique_ptr<T[], FreeAligned> aligned(std::size_t count) {
     return std::unique_ptr<T[], FreeAligned>(memory);
 }
 
+// The smallest multiple of `step` that is at least `n`.
 constexpr int padded(int n, int step) { return (n + step - 1) / step * step; }
 
-// The upper half of a float, rounded to nearest, ties to even.
+// The float rounded to bfloat16, which is the upper half of its bits. Rounds to nearest, ties to even.
 inline std::uint32_t bfloat16(float value) { return (bits(value) + 0x7fff + (bits(value) >> 16 & 1)) >> 16; }
 
 }  // namespace detail
 
+// Owns the weights. `view()` points to them, and stays valid when the network is moved.
 class Network {
 public:
     Network() = default;
 
-    // With `compact`, or for avx512_bf16, weights are rounded to bfloat16, which takes half the memory.
+    // Rounds the weights to bfloat16 if `compact` is true or `set` is avx512_bf16. They then take half the memory.
     Network(const std::vector<Layer>& layers, InstructionSet set, bool compact) : kernels_(&kernels(set)) {
         if (layers.size() > DEEPEST_NETWORK)
             throw Error("a network of more than " + std::to_string(DEEPEST_NETWORK) + " layers");
@@ -43,7 +45,11 @@ public:
         const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
         int in = detail::padded(layers.front().in, INPUT_STEP);
         for (std::size_t k = 0; k < layers.size(); ++k) {
-            const int out = layers[k].out + (k + 1 == layers.size());
+            // The output layer gets at least one neuron of padding. Its weights and its bias are 0, so it returns 0,
+            // and its range in `Ranges` is 0, so it is decoded to 0. `Adapter::lay_out_lanes` (nma.h) needs such an
+            // output.
+            const bool last = k + 1 == layers.size();
+            const int out = layers[k].out + (last ? 1 : 0);
             if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER)
                 throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
             LayerView& view = view_.layers[k];
@@ -63,24 +69,26 @@ public:
     const Kernels& kernels_in_use() const { return *kernels_; }
     const NetworkView& view() const { return view_; }
 
-    // Rows of inputs and outputs have room for these many numbers. Inputs beyond the network's own are 0, and so are
-    // outputs, of which there is at least one.
+    // The lengths of a query's inputs and outputs, including the padding. The padding of the inputs must be 0. The
+    // outputs have at least one number of padding, and all their padding is 0.
     int input_stride() const { return view_.layers[0].in; }
     int output_stride() const { return view_.layers[view_.depth - 1].width; }
 
-    // `outputs` is aligned to 64 bytes.
+    // `outputs` must be aligned to 64 bytes.
     void forward(const float* inputs, float* outputs) const { kernels_->forward(view_, inputs, outputs); }
     void forward_many(int queries, const float* inputs, float* outputs) const {
         kernels_->forward_many(view_, queries, inputs, input_stride(), outputs, output_stride());
     }
 
 private:
+    // A new array of `count` zeros, owned by `kept`.
     template <class T>
     T* room(std::vector<std::unique_ptr<T[], detail::FreeAligned>>& kept, std::size_t count) {
         kept.push_back(detail::aligned<T>(count));
         return kept.back().get();
     }
 
+    // The functions `keep...` copy weights into an order of layout.h, where it is explained.
     const float* keep(const std::vector<float>& values, int width) {
         float* to = room(floats_, width);
         std::copy(values.begin(), values.end(), to);
@@ -96,10 +104,13 @@ private:
 
     const float* keep_turned(const LayerView& view) {
         float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
+        // In the letters of layout.h: i = 4 b + r and j = 4 g + k.
         for (int i = 0; i < view.in; ++i)
-            for (int j = 0; j < view.width; ++j)
+            for (int j = 0; j < view.width; ++j) {
+                const int input = i / 4 * 4 + j % 4, neuron = j / 4 * 4 + (j + i) % 4;
                 to[(j / WIDTH_STEP * view.in + i) * WIDTH_STEP + j % WIDTH_STEP] =
-                    view.columns[(i / 4 * 4 + j % 4) * view.width + j / 4 * 4 + (j + i) % 4];
+                    view.columns[input * view.width + neuron];
+            }
         return to;
     }
 

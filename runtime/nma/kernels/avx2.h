@@ -3,7 +3,7 @@
 
 #include <immintrin.h>
 
-#include "../recipe.h"
+#include "../preparation.h"
 #include "macros.h"
 
 #define NMA_FN NMA_TARGET("avx2,fma")
@@ -36,7 +36,7 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
     return _mm256_castsi256_ps(_mm256_and_si256(raw(pairs), _mm256_set1_epi32(-65536)));
 }
 
-using Few = Indexed;
+using Few = Indexed;  // in memory
 
 #include "body.inl"
 

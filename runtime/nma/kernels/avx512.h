@@ -1,10 +1,13 @@
 // x86-64 with AVX-512 F, BW, DQ and VL: sixteen lanes, 32 registers.
+//
+// After the common kernels of body.inl come kernels for narrow networks, whose activations stay in registers. They read
+// `LayerView::turned`, which layout.h explains.
 #pragma once
 
 #include <cstring>
 #include <immintrin.h>
 
-#include "../recipe.h"
+#include "../preparation.h"
 #include "macros.h"
 
 #define NMA_FN NMA_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma")
@@ -16,7 +19,7 @@ constexpr int LANES = 16, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 6;
 
 using Vec = __m512;
 
-// All lanes. GCC 12 warns of its own headers where an intrinsic takes no mask (bug 105593).
+// The mask of all lanes. Intrinsics without a mask make GCC 12 warn about its own headers (bug 105593).
 constexpr __mmask16 ALL = 0xffff;
 
 NMA_OP Vec load(const float* p) { return _mm512_load_ps(p); }
@@ -26,7 +29,7 @@ NMA_OP Vec add(Vec a, Vec b) { return _mm512_add_ps(a, b); }
 NMA_OP Vec sub(Vec a, Vec b) { return _mm512_sub_ps(a, b); }
 NMA_OP Vec mul(Vec a, Vec b) { return _mm512_mul_ps(a, b); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a, b, c); }
-// 14 bits, doubled by a step of Newton: a division takes twice as long.
+// An estimate with 14 bits, whose digits one Newton step doubles. A division would take twice as long.
 NMA_OP Vec inverse(Vec a) {
     const Vec near = _mm512_maskz_rcp14_ps(ALL, a);
     return fma(near, _mm512_fnmadd_ps(a, near, set(1.0f)), near);
@@ -43,7 +46,8 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
     return _mm512_castsi512_ps(_mm512_and_si512(raw(pairs), _mm512_set1_epi32(-65536)));
 }
 
-// At most 32 numbers, out of registers.
+// Twin of `Indexed` in preparation.h, for at most 32 numbers: it picks them from two registers instead of memory. A
+// call returns `nma::LANES` numbers, which are 4, and reads as many indices. LANES alone is 16 here.
 struct Few {
     static constexpr int MOST = 2 * LANES;
     Vec low, high;
@@ -61,7 +65,8 @@ struct Few {
 
 #include "body.inl"
 
-// A column's four numbers from `p` on, or from block B of a vector on, in all blocks of four lanes.
+// The kernels below see a vector as four blocks of four lanes. `repeat` copies four numbers into all blocks: the four
+// at `p`, or block B of `v`.
 NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_loadu_ps(p)); }
 template <int B>
 NMA_OP Vec repeat(Vec v) {
@@ -73,23 +78,26 @@ NMA_OP Vec turn(Vec v) {
     return _mm512_maskz_permute_ps(ALL, v, R == 1 ? 0x93 : 0x4e);
 }
 
-// Adds what four inputs, in all blocks, contribute by four columns to the sums that are still to be turned.
+// Adds four inputs to the sums of 16 neurons. `inputs` repeats the four inputs in all blocks. `columns` points to their
+// four columns of `LayerView::turned`. Sum r is still to be turned by r lanes.
 NMA_OP void add_block(Vec (&sums)[4], Vec inputs, const float* columns) {
     NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * LANES), sums[r]);
 }
-NMA_OP Vec turned(const Vec (&sums)[4]) {
+// The neurons: the sums, each turned by its own number of lanes, added up.
+NMA_OP Vec total(const Vec (&sums)[4]) {
     return add(add(sums[0], turn<1>(sums[1])), turn<2>(add(sums[2], turn<1>(sums[3]))));
 }
 
-// A layer of two vectors for inputs in memory, and for the two vectors of the layer before it.
+// The first layer, whose inputs lie in memory. Its NARROW neurons fill the two vectors `y`.
 NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
         const float* column = layer.turned + v * layer.in * LANES;
         Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
         for (int i = 0; i < layer.in; i += 4) add_block(sums, repeat(x + i), column + i * LANES);
-        y[v] = turned(sums);
+        y[v] = total(sums);
     }
 }
+// Any other layer. `y` holds the neurons of the layer before it, and then its own.
 NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     const Vec a = max(y[0], set(0.0f)), b = max(y[1], set(0.0f));
     const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a),
@@ -97,41 +105,44 @@ NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
         Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
         NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.turned + (v * 8 + k) * 4 * LANES);
-        y[v] = turned(sums);
+        y[v] = total(sums);
     }
 }
 
-NMA_OP void narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]) {
+// All layers of a narrow network.
+NMA_OP void run_narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]) {
     first_layer(view.layers[0], inputs, y);
     for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
 }
 
-NMA_FN inline void forward_narrow(const NetworkView& view, const float* inputs, float* outputs) {
+// `forward` for any network, in registers if it is narrow.
+NMA_FN inline void forward_either(const NetworkView& view, const float* inputs, float* outputs) {
     if (!view.narrow) return forward(view, inputs, outputs);
     Vec y[2];
-    narrow(view, inputs, y);
+    run_narrow(view, inputs, y);
     store(outputs, y[0]);
     store(outputs + LANES, y[1]);
 }
 
-NMA_FN NMA_WHOLE inline void prepare_narrow(const Recipe& recipe, const float* parameters, const Vec3<float>& wi,
-                                            Blend<float>& blend) {
+NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, const float* parameters,
+                                            const Vec3<float>& wi, Blend<float>& blend) {
     alignas(64) float inputs[WIDEST_LAYER], numbers[NARROW];
     Vec y[2];
-    encode(recipe, parameters, wi, inputs);
-    narrow(recipe.network, inputs, y);
+    encode(preparation, parameters, wi, inputs);
+    run_narrow(preparation.network, inputs, y);
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
-        y[v] = decoded(recipe.ranges, v * LANES, y[v], 1.0f - wi.z * wi.z);
+        y[v] = decoded(preparation.ranges, v * LANES, y[v], 1.0f - wi.z * wi.z);
         store(numbers + v * LANES, y[v]);
     }
-    assemble(recipe, numbers, Few(y[0], y[1]), blend);
-    weigh(blend, wi.z, recipe.bounded);
+    assemble(preparation, numbers, Few(y[0], y[1]), blend);
+    weigh(blend, wi.z, preparation.bounded);
 }
 
-NMA_FN inline void prepare_either(const Recipe& recipe, const float* parameters, const Vec3<float>& wi,
+// `prepare` for any network, in registers if it is narrow.
+NMA_FN inline void prepare_either(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
                                   Blend<float>& blend) {
-    if (recipe.network.narrow) return prepare_narrow(recipe, parameters, wi, blend);
-    prepare<forward>(recipe, parameters, wi, blend);
+    if (preparation.network.narrow) return prepare_narrow(preparation, parameters, wi, blend);
+    prepare<forward>(preparation, parameters, wi, blend);
 }
 
 }  // namespace nma::avx512

@@ -1,5 +1,7 @@
-// x86-64 with AVX512-BF16, whose dot product takes two inputs at once: activations are rounded to bfloat16 (8 bits),
-// sums are float32. Layers must have `pairs`.
+// x86-64 with AVX512-BF16. Its instruction multiplies two inputs by two weights at once and adds both products. Inputs
+// and activations are rounded to bfloat16, which keeps 8 significant bits; sums are float32. Layers must have `pairs`.
+//
+// Only the network differs from avx512.h. `encode`, `decode` and `odds` are shared with it.
 #pragma once
 
 #include <cstring>
@@ -14,7 +16,8 @@ namespace nma::avx512_bf16 {
 using avx512::LANES;
 using avx512::Vec;
 
-// VECTORS vectors of neurons from `first` on, for QUERIES queries whose inputs lie in pairs. Twin of tile in body.inl.
+// Computes VECTORS vectors of neurons, the first of which is neuron `first`, for QUERIES queries. `x` holds the inputs
+// in pairs. Twin of `tile` in body.inl.
 template <int VECTORS, int QUERIES, int SUMS>
 NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y,
                         int y_stride) {
@@ -55,14 +58,14 @@ NMA_FN inline void tiles(const LayerView& layer, int first, const std::uint32_t*
         if (first < layer.width) tiles<VECTORS / 2, QUERIES>(layer, first, x, x_stride, y, y_stride);
 }
 
-// Sixteen floats as bfloat16 in eight pairs, rounded to nearest.
+// Stores sixteen floats as eight pairs of bfloat16, rounded to nearest.
 NMA_OP void store_pairs(std::uint32_t* pairs, Vec v) {
     _mm256_store_si256(reinterpret_cast<__m256i*>(pairs), (__m256i)_mm512_cvtneps_pbh(v));
 }
 
 template <int QUERIES>
-NMA_FN inline void network(const NetworkView& view, const float* inputs, int input_stride, float* outputs,
-                           int output_stride) {
+NMA_FN inline void run_layers(const NetworkView& view, const float* inputs, int input_stride, float* outputs,
+                              int output_stride) {
     alignas(64) float y[QUERIES * WIDEST_LAYER];
     alignas(64) std::uint32_t x[QUERIES * WIDEST_LAYER / 2];
     constexpr int STRIDE = WIDEST_LAYER / 2;
@@ -84,14 +87,14 @@ NMA_FN inline void network(const NetworkView& view, const float* inputs, int inp
 }
 
 NMA_FN inline void forward(const NetworkView& view, const float* inputs, float* outputs) {
-    network<1>(view, inputs, 0, outputs, 0);
+    run_layers<1>(view, inputs, 0, outputs, 0);
 }
 
 NMA_FN inline void forward_many(const NetworkView& view, int queries, const float* inputs, int input_stride,
                                 float* outputs, int output_stride) {
     int q = 0;
     for (; q + 6 <= queries; q += 6)
-        network<6>(view, inputs + q * input_stride, input_stride, outputs + q * output_stride, output_stride);
+        run_layers<6>(view, inputs + q * input_stride, input_stride, outputs + q * output_stride, output_stride);
     for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
 }
 

@@ -1,12 +1,27 @@
-// The kernels, compiled once for each instruction set inside its namespace. No include guard: that is the point.
+// The kernels in terms of a vector type. portable.h, neon.h, avx2.h and avx512.h each include this text inside their
+// own namespace, so it has no include guard and no namespace. It includes nothing. The including header has these
+// names:
 //
-// Before it stand NMA_FN (attributes of a function for this instruction set), NMA_OP (the same, always inlined),
-// NMA_UNROLL, Vec (LANES floats) with load, store, set, add, sub, mul, fma (a b + c), inverse (1 / a), max, min,
-// nearest (round to whole), scale (a 2^whole), even and odd (floats from the low and high halves of a pair), and the
-// sizes of tiles: SINGLE_TILE vectors of neurons for one query, BATCH_TILE vectors for each of BATCH_QUERIES.
+//     NMA_FN        macro: the attributes of a function for this instruction set
+//     NMA_OP        macro: the same attributes, and the function is always inlined
+//     Vec, LANES    the vector type, and its count of floats: 4, 8 or 16. It hides `nma::LANES`, which is 4
+//     load, store, set, add, sub, mul, max, min
+//     fma           a b + c
+//     inverse       1 / a
+//     nearest       rounds to a whole number
+//     scale         a 2^b for a whole number b
+//     even, odd     the low and the high bfloat16 of each pair, as floats
+//     SINGLE_TILE   vectors of neurons that a tile has for a single query
+//     BATCH_TILE    vectors of neurons that a tile has for each query of a batch
+//     BATCH_QUERIES queries that a tile of a batch has
+//     Few           picks numbers for lanes, from registers if possible: see `Indexed` in preparation.h
+//
+// `forward`, `forward_many`, `encode`, `decode`, `odds` and `prepare` are the kernels. `Kernels` (kernels.h) points to
+// them by the same names. All other functions here serve these six.
 
-// `VECTORS` vectors of neurons from `first` on, for QUERIES queries. A neuron's sum is kept as SUMS sums: in a single
-// one each multiplication would wait for the one before it.
+// Computes VECTORS vectors of neurons, the first of which is neuron `first`, for QUERIES queries. A neuron has SUMS
+// partial sums: in a single sum, each multiplication would wait for the one before it. PAIRS says whether the weights
+// are `pairs` rather than `columns`.
 template <int VECTORS, int QUERIES, int SUMS, bool PAIRS>
 NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                         bool relu) {
@@ -54,7 +69,7 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
     }
 }
 
-// All neurons of a layer in tiles of VECTORS, what is left in halves.
+// Computes all neurons of a layer from `first` on in tiles of VECTORS vectors. The rest takes tiles of half the size.
 template <int VECTORS, int QUERIES, bool PAIRS>
 NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                          bool relu) {
@@ -65,8 +80,10 @@ NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int 
         if (first < layer.width) tiles<VECTORS / 2, QUERIES, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
 }
 
+// Computes all layers of a network for QUERIES queries.
 template <int VECTORS, int QUERIES>
-NMA_FN inline void network(const NetworkView& view, const float* x, int x_stride, float* outputs, int output_stride) {
+NMA_FN inline void run_layers(const NetworkView& view, const float* x, int x_stride, float* outputs,
+                              int output_stride) {
     alignas(64) float buffers[2][QUERIES * WIDEST_LAYER];
     for (int k = 0; k < view.depth; ++k) {
         const LayerView& layer = view.layers[k];
@@ -81,19 +98,20 @@ NMA_FN inline void network(const NetworkView& view, const float* x, int x_stride
 }
 
 NMA_FN inline void forward(const NetworkView& view, const float* inputs, float* outputs) {
-    network<SINGLE_TILE, 1>(view, inputs, 0, outputs, 0);
+    run_layers<SINGLE_TILE, 1>(view, inputs, 0, outputs, 0);
 }
 
 NMA_FN inline void forward_many(const NetworkView& view, int queries, const float* inputs, int input_stride,
                                 float* outputs, int output_stride) {
     int q = 0;
     for (; q + BATCH_QUERIES <= queries; q += BATCH_QUERIES)
-        network<BATCH_TILE, BATCH_QUERIES>(view, inputs + q * input_stride, input_stride, outputs + q * output_stride,
-                                           output_stride);
+        run_layers<BATCH_TILE, BATCH_QUERIES>(view, inputs + q * input_stride, input_stride,
+                                              outputs + q * output_stride, output_stride);
     for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
 }
 
-// 2^x for |x| <= 126 to two units in the last place: 2^n times the series of the rest, which is at most 1/2.
+// 2^x for |x| <= 126, to two units in the last place: 2^n for the nearest whole number n, times a series in x - n,
+// which is at most 1/2.
 NMA_OP Vec exp2(Vec x) {
     const Vec n = nearest(x), r = sub(x, n), r2 = mul(r, r);
     const Vec low = fma(fma(r, set(0.0555041087f), set(0.240226507f)), r2, fma(r, set(0.693147181f), set(1.0f)));
@@ -102,7 +120,8 @@ NMA_OP Vec exp2(Vec x) {
     return scale(fma(high, mul(r2, r2), low), n);
 }
 
-// Raw outputs from number k on to numbers of the target. Twin of nma/target/decode.py.
+// Decodes a vector of raw outputs, the first of which has index k. `Ranges` has the formula. `fade` is sin^2(theta_i).
+// Twin of nma/target/decode.py.
 NMA_OP Vec decoded(const Ranges& ranges, int k, Vec raw, float fade) {
     const Vec one = set(1.0f), faded = fma(load(ranges.in_plane + k), set(fade - 1.0f), one);
     const Vec x = max(min(mul(raw, set(-1.44269504f)), set(120.0f)), set(-120.0f));
@@ -112,27 +131,30 @@ NMA_OP Vec decoded(const Ranges& ranges, int k, Vec raw, float fade) {
     return fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value);
 }
 
-NMA_FN NMA_WHOLE inline void encode(const Recipe& recipe, const float* parameters, const Vec3<float>& wi,
+NMA_FN NMA_WHOLE inline void encode(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
                                     float* inputs) {
-    recipe.encoding.encode(parameters, wi, inputs, recipe.network.layers[0].in);
+    preparation.encoding.encode(parameters, wi, inputs, preparation.network.layers[0].in);
 }
 
-// The blend of a network's outputs, but for its odds; those of a blend.
-NMA_FN NMA_WHOLE inline void decode(const Recipe& recipe, float* raw, float cosine, Blend<float>& blend) {
-    for (int k = 0; k < recipe.ranges.count; k += LANES)
-        store(raw + k, decoded(recipe.ranges, k, load(raw + k), 1.0f - cosine * cosine));
-    if (recipe.ranges.count <= Few::MOST) assemble(recipe, raw, Few(raw), blend);
-    else assemble(recipe, raw, Indexed(raw), blend);
+// Decodes the raw outputs in place and fills in the blend, except for its odds.
+NMA_FN NMA_WHOLE inline void decode(const Preparation& preparation, float* raw, float cosine, Blend<float>& blend) {
+    for (int k = 0; k < preparation.ranges.count; k += LANES)
+        store(raw + k, decoded(preparation.ranges, k, load(raw + k), 1.0f - cosine * cosine));
+    if (preparation.ranges.count <= Few::MOST) assemble(preparation, raw, Few(raw), blend);
+    else assemble(preparation, raw, Indexed(raw), blend);
 }
-NMA_FN NMA_WHOLE inline void odds(const Recipe& recipe, float cosine, Blend<float>& blend) {
-    weigh(blend, cosine, recipe.bounded);
+// Fills in the odds of a decoded blend.
+NMA_FN NMA_WHOLE inline void odds(const Preparation& preparation, float cosine, Blend<float>& blend) {
+    weigh(blend, cosine, preparation.bounded);
 }
 
+// All steps for one query. FORWARD runs the network.
 template <void (*FORWARD)(const NetworkView&, const float*, float*)>
-NMA_FN inline void prepare(const Recipe& recipe, const float* parameters, const Vec3<float>& wi, Blend<float>& blend) {
+NMA_FN inline void prepare(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
+                           Blend<float>& blend) {
     alignas(64) float inputs[WIDEST_LAYER], numbers[WIDEST_LAYER];
-    encode(recipe, parameters, wi, inputs);
-    FORWARD(recipe.network, inputs, numbers);
-    decode(recipe, numbers, wi.z, blend);
-    odds(recipe, wi.z, blend);
+    encode(preparation, parameters, wi, inputs);
+    FORWARD(preparation.network, inputs, numbers);
+    decode(preparation, numbers, wi.z, blend);
+    odds(preparation, wi.z, blend);
 }

@@ -1,4 +1,4 @@
-// Attributes by which a function is compiled for an instruction set that the rest of the program need not have.
+// Attributes that compile a single function for an instruction set. The rest of the program does not need that set.
 #pragma once
 
 #if defined(__clang__)
@@ -12,7 +12,7 @@
 #if defined(__GNUC__)
 #define NMA_TARGET(features) __attribute__((target(features)))
 #define NMA_INLINE inline __attribute__((always_inline))
-// What such a function calls becomes part of it, and so is compiled for its instruction set.
+// Inlines all that the function calls, so that the called code is compiled for the same instruction set.
 #define NMA_WHOLE __attribute__((flatten))
 #else
 #define NMA_TARGET(features)

@@ -1,9 +1,9 @@
-// AArch64, where NEON is always there: four lanes, 32 registers.
+// AArch64, which always has NEON: four lanes, 32 registers.
 #pragma once
 
 #include <arm_neon.h>
 
-#include "../recipe.h"
+#include "../preparation.h"
 #include "macros.h"
 
 #define NMA_FN
@@ -34,7 +34,7 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
     return vreinterpretq_f32_u32(vandq_u32(vld1q_u32(pairs), vdupq_n_u32(0xffff0000u)));
 }
 
-using Few = Indexed;
+using Few = Indexed;  // in memory
 
 #include "body.inl"
 

@@ -1,10 +1,10 @@
-// Four lanes of plain C++, which compilers turn into the vectors of their target.
+// Plain C++ with four lanes. Compilers turn it into vectors of their target.
 #pragma once
 
 #include <cmath>
 #include <cstring>
 
-#include "../recipe.h"
+#include "../preparation.h"
 #include "macros.h"
 
 #define NMA_FN
@@ -88,7 +88,7 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
     return each([&](int k) { return from_bits(pairs[k] & 0xffff0000u); });
 }
 
-using Few = Indexed;
+using Few = Indexed;  // in memory
 
 #include "body.inl"
 
