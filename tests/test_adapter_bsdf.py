@@ -1,4 +1,4 @@
-"""The Mitsuba BSDF `nma`: it shows what its adapter says, its methods agree, edits show at once, errors are clear."""
+"""The Mitsuba BSDF `nma` has the values of its adapter, its methods agree, and it checks inputs and edits."""
 
 import json
 import math
@@ -41,7 +41,7 @@ def _variant():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """A small adapter, quick to compile; what it shows is arbitrary, but varies with every parameter."""
+    """The weights of a small adapter, which compiles quickly. Its values are arbitrary and vary with every input."""
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     random_adapter(hidden="2x8").save(path)
     return path
@@ -49,7 +49,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stretched_weights(tmp_path_factory):
-    """The same with lobes stretched in the plane of incidence, and dimmed where they might gain light."""
+    """The weights of a small adapter with bounded energy and with lobes stretched in the plane of incidence."""
     path = tmp_path_factory.mktemp("weights") / "stretched.safetensors"
     replace(random_adapter(hidden="2x8", params=target.STRETCHED_PARAMS), bounded=True).save(path)
     return path
@@ -65,13 +65,13 @@ def description(weights, **changes):
 
 
 def textured(weights, **changes):
-    """The same material, three of its parameters as textures of one colour."""
+    """Returns the description of the same material, with three parameters as textures of one colour."""
     images = {name: bitmap_texture(np.full((4, 8, np.size(v)), v)) for name, v in TEXTURED.items()}
     return description(weights, **images, **changes)
 
 
 def interactions(n, seed=0):
-    """Surface interactions with random wi on the front."""
+    """Returns n surface interactions with random wi on the front side."""
     rng = mi.PCG32(n, seed)
     si = dr.zeros(mi.SurfaceInteraction3f, n)
     si.wi = mi.warp.square_to_uniform_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
@@ -89,7 +89,10 @@ def close(a, b, rtol=1e-4, atol=1e-6):
 
 @pytest.mark.parametrize("make", (description, textured))
 def test_values_are_those_of_the_adapter(weights, make):
-    """Against NumPy; untextured materials within the error of linear interpolation between nodes of the curves."""
+    """The BSDF has the values and densities that NumPy computes from the adapter.
+
+    Untextured materials read curves, whose linear interpolation makes an error of 2e-4. Textured ones have 1e-5.
+    """
     bsdf, (si, rng) = mi.load_dict(make(weights)), interactions(2000)
     wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
@@ -101,14 +104,14 @@ def test_values_are_those_of_the_adapter(weights, make):
     expected, density = brdf.eval_pdf(Vec3(*wi), Vec3(*np.array(wo, np.float64)))
     for found, wanted in ((value, np.stack(expected)), (pdf, density)):
         error = np.abs(np.array(found) - wanted) / wanted
-        # Near a narrow peak single precision shows.
+        # Single precision makes larger errors near narrow peaks.
         assert error.mean() < (1e-5 if make is textured else 2e-4)
         assert error.max() < 1e-2
 
 
 @pytest.mark.parametrize(("instances", "directional"), VARIANTS.values(), ids=VARIANTS)
-def test_every_variant_is_shown(tmp_path, instances, directional):
-    """Of any number of instances, with parameters that follow the direction or not: against NumPy."""
+def test_every_variant_of_adapters_has_the_values_of_numpy(tmp_path, instances, directional):
+    """The BSDF equals NumPy within 1 % for every number of instances, with and without dependence on the direction."""
     random_adapter(instances, directional, hidden="1x4").save(tmp_path / "w.safetensors")
     adapter, (si, rng) = Adapter.load(tmp_path / "w.safetensors"), interactions(500)
     wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
@@ -121,7 +124,7 @@ def test_every_variant_is_shown(tmp_path, instances, directional):
 
 @pytest.mark.parametrize("make", (description, textured))
 def test_stretched_lobes_turn_with_the_view(stretched_weights, make):
-    """Isotropic all the same: turning both directions about the normal changes nothing, wherever wi stands."""
+    """A material with stretched lobes is isotropic: rotating both directions about the normal changes no value."""
     bsdf, ctx, (si, rng) = mi.load_dict(make(stretched_weights)), mi.BSDFContext(), interactions(2000)
     wo = bsdf.sample(ctx, si, *drawn(rng))[0].wo
     valid = wo.z > 0
@@ -146,7 +149,7 @@ def test_stretched_lobes_turn_with_the_view(stretched_weights, make):
 
 @pytest.mark.parametrize("make", (description, textured))
 @pytest.mark.parametrize("stretched", (False, True), ids=("principled", "stretched"))
-def test_methods_agree(weights, stretched_weights, make, stretched):
+def test_the_methods_of_the_bsdf_agree(weights, stretched_weights, make, stretched):
     weights = stretched_weights if stretched else weights
     bsdf, ctx, (si, rng) = mi.load_dict(make(weights)), mi.BSDFContext(), interactions(1000)
     wo, numbers = mi.warp.square_to_cosine_hemisphere(drawn(rng)[1]), drawn(rng)
@@ -173,8 +176,12 @@ def test_methods_agree(weights, stretched_weights, make, stretched):
 
 
 @pytest.mark.parametrize("material", ("gold-red-lacquer", "frosted-silver", "car-paint-blue"))
-def test_chi_square(material):
-    """Samples follow `pdf` (level .01, Sidak-corrected over three directions, by the shipped adapters)."""
+def test_samples_follow_the_pdf(material):
+    """Samples of each shipped adapter follow `pdf` (chi-square test).
+
+    The false-alarm rate is .01 per adapter and material, over three directions together (Sidak). A failure means biased
+    renderings.
+    """
     for adapter in shipped():
         bsdf = {
             "type": "nma",
@@ -192,12 +199,12 @@ def test_chi_square(material):
                 sample_dim=3,
                 sample_count=1 << 17,
                 res=51,
-                ires=32,  # with 8, the test's own integral of a narrow lobe is off by half a per cent
+                ires=32,  # with ires=8, the test's own integral of a narrow lobe is .5 % off
             )
             assert test.run(0.01, 3), (adapter, wi, test.messages)
 
 
-def test_the_back_and_other_lobes_are_dark(weights):
+def test_the_back_and_other_lobe_types_are_black(weights):
     bsdf, (si, rng) = mi.load_dict(description(weights)), interactions(100)
     wo = mi.Vector3f(0.0, 0.6, 0.8)
     diffuse = mi.BSDFContext()
@@ -229,7 +236,7 @@ def scene(bsdf, name="material", **integrator):
 
 
 def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
-    """With the same random numbers, curves instead of the network and evaluated loops change roundings alone."""
+    """Curves, the network and evaluated loops render equal pictures from equal random numbers, up to rounding."""
     curves = np.array(mi.render(scene(description(weights)), spp=16, seed=1))
     loaded = scene(textured(weights))
     network = np.array(mi.render(loaded, spp=16, seed=1))
@@ -237,7 +244,7 @@ def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
     with dr.scoped_set_flag(flags[0], False), dr.scoped_set_flag(flags[1], False):
         wavefront = np.array(mi.render(loaded, spp=16, seed=1))
     assert curves.mean() > 0.1
-    # A rounding may send a sample elsewhere; a hundredth of the pixels may hold such samples.
+    # Rounding may change the direction of a sample completely. Up to 1 % of the pixels may contain such samples.
     for other in (curves, wavefront):
         off = np.abs(network - other) > 0.01 * network
         assert off.mean() < 0.01
@@ -245,7 +252,10 @@ def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
 
 
 def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
-    """In the kernel of a path tracer, which asks for a value and for a sample each time its loop is recorded."""
+    """A path tracer evaluates and samples a BSDF at each shading point, and runs the network once for both.
+
+    A failure means that the network runs more often than needed, and pictures take longer.
+    """
     calls = []
 
     def counted(function):
@@ -259,7 +269,7 @@ def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
         monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
     dr.eval(mi.render(scene(textured(weights)), spp=1))
     assert calls.count("forward_lanes") == calls.count("eval_pdf") == calls.count("sample") > 0
-    # Elsewhere nothing is kept.
+    # Outside of a rendering, each call runs the network.
     bsdf, (si, rng) = mi.load_dict(textured(weights)), interactions(10)
     calls.clear()
     bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(0.0, 0.6, 0.8))
@@ -267,7 +277,7 @@ def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
     assert calls.count("forward_lanes") == 2
 
 
-def test_edits_show_at_once(weights):
+def test_edits_take_effect_at_once(weights):
     ctx, (si, _) = mi.BSDFContext(), interactions(100)
     wo = mi.Vector3f(0.0, 0.6, 0.8)
     for make in (description, textured):

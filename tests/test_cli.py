@@ -1,4 +1,4 @@
-"""The command line: what it prints where, what it writes, and how it fails."""
+"""The command line: its help, its documentation, and its error messages."""
 
 import re
 import shlex
@@ -17,18 +17,18 @@ APP = typer.main.get_command(cli.app)
 COMMANDS = tuple(APP.commands)
 
 
-# What takes long to import, and what only the work of a command needs.
+# These packages take long to import. Only the work of a command needs them.
 HEAVY = ("numpy", "mitsuba", "drjit", "jax", "zarr", "PIL", "matplotlib")
 
 
-def test_every_command_is_a_file_of_its_name():
+def test_every_command_has_a_file_of_its_name():
     for words, function in commands():
         file = function.__module__.removeprefix("nma.cli.")
         assert file in cli.COMMANDS
-        assert file in words[0].split("-")  # train-library stands in library.py
+        assert file in words[0].split("-")  # train-library is in library.py
 
 
-def test_help_and_version_import_nothing_that_takes_long():
+def test_help_and_version_import_no_slow_package():
     for option in ("--help", "--version"):
         code = f"""
 import sys
@@ -51,7 +51,7 @@ def test_every_command_explains_itself(nma, command):
 
 
 def test_the_documentation_has_every_command_with_every_option():
-    """docs/commands.md has a section for each command, and in it exactly the options that the command takes."""
+    """docs/commands.md has a section for each command, which lists exactly the options of the command."""
     text = (DOCS / "commands.md").read_text()
     sections = dict(re.findall(r"^## `nma ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
     assert set(sections) == set(COMMANDS)
@@ -64,7 +64,7 @@ def test_the_documentation_has_every_command_with_every_option():
 
 
 def test_the_examples_of_the_documentation_parse():
-    """Every line that starts with `nma` in a block of code, in all pages."""
+    """The parser accepts every line that starts with `nma` in the code blocks of all pages."""
     pages = [*DOCS.glob("*.md"), DOCS.parent / "README.md"]
     blocks = [
         b for page in pages for b in re.findall(r"^```(?:sh)?\n(.*?)^```", page.read_text(), re.M | re.S)

@@ -1,4 +1,4 @@
-"""`nma compare` judges images, and adapters by their pictures."""
+"""`nma compare` measures the difference of two images, or of the pictures of an adapter and a simulation."""
 
 import json
 
@@ -8,7 +8,7 @@ import pytest
 from nma.images.io import write_exr
 
 
-def test_compare_two_images(nma, tmp_path):
+def test_compare_prints_the_errors_between_two_images(nma, tmp_path):
     image = np.random.default_rng(0).random((16, 16, 3), dtype=np.float32)
     a, b = write_exr(tmp_path / "a.exr", image), write_exr(tmp_path / "b.exr", image * 1.1)
     code, out, _ = nma("compare", a, b, "--json", "-o", tmp_path / "difference.png")
@@ -21,7 +21,7 @@ def test_compare_two_images(nma, tmp_path):
 
 
 @pytest.mark.slow
-def test_compare_a_material_with_its_reference(nma, untrained):
+def test_compare_prints_the_errors_of_an_adapter_and_the_noise_of_its_reference(nma, untrained):
     options = ("--adapter", untrained, "--size", 16, "--spp", 2, "--json")
     code, out, err = nma("compare", "gold-red-lacquer", *options)
     assert code == 0, err

@@ -1,4 +1,4 @@
-"""What commands print can be read, however narrow the terminal."""
+"""The output of commands is readable on terminals of every width."""
 
 import io
 import sys
@@ -16,7 +16,7 @@ from nma.train.recipe import SINGLE
 
 
 def printed(monkeypatch, width, *table):
-    """The lines of a table on a terminal of that width."""
+    """Prints a table for a terminal of this width, and returns its lines."""
     monkeypatch.setattr(console, "out", Console(width=width, file=io.StringIO()))
     console.out.print(console.table(*table))
     return [line.rstrip() for line in console.out.file.getvalue().splitlines()]
@@ -39,7 +39,7 @@ def test_numbers_are_never_broken(monkeypatch, width):
 
 
 def test_the_figures_of_an_evaluation_fit_80_columns(monkeypatch):
-    """The figures are of usual size: some thousandths, a few smaller ones, and a PSNR."""
+    """A row of typical figures fits into one line of 80 columns, without lost digits."""
     row = ("mean", 0.002731, 0.004236, 0.09136, 0.07076, 0.001586, 64.42, 0.00521, 0.001035)
     lines = printed(monkeypatch, 80, ("material", *FIGURES), [row])
     assert len(row) == 1 + len(FIGURES)
@@ -71,7 +71,7 @@ def test_numbers_have_four_digits_or_two_where_they_are_tiny():
 
 
 @pytest.mark.parametrize("width", [60, 80])
-def test_what_commands_print_fits_the_terminal(nma, monkeypatch, width):
+def test_the_output_of_commands_fits_the_terminal(nma, monkeypatch, width):
     monkeypatch.setattr(console, "out", Console(width=width))
     for words in (("materials",), ("materials", "gold-red-lacquer"), ("info",), ("info", "layered3-3x32")):
         code, out, err = nma(*words)
@@ -79,7 +79,7 @@ def test_what_commands_print_fits_the_terminal(nma, monkeypatch, width):
         assert max(map(len, out.splitlines())) <= width, words
 
 
-def test_a_fit_shows_a_bar_on_terminals_alone_and_none_if_told(monkeypatch):
+def test_a_fit_shows_a_bar_only_on_terminals_and_only_without_a_callback(monkeypatch):
     class Bar:
         made = 0
 
@@ -105,7 +105,7 @@ def test_a_fit_shows_a_bar_on_terminals_alone_and_none_if_told(monkeypatch):
 
 
 def test_the_bar_of_a_short_training_is_full_at_its_end(monkeypatch):
-    """Such a training reports its loss only once."""
+    """The progress bar shows 30/30 steps even if a training reports its loss only once, at the end."""
     monkeypatch.setattr(progress, "err", Console(file=io.StringIO(), width=100))
     with progress.TrainingBar(SimpleNamespace(steps=30, bins_per_step=1)) as bar:
         bar.update(SimpleNamespace(step=30, log_losses=[0.1]))

@@ -1,4 +1,4 @@
-"""`nma dataset` says what it is about to do."""
+"""`nma dataset` reports its speed and how long it will take."""
 
 from nma.cli.dataset import _span
 

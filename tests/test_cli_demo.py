@@ -10,7 +10,7 @@ from nma.images.io import read_image
 
 @pytest.mark.slow
 def test_demo_draws_two_rows_and_prints_six_lines(nma, untrained, tmp_path, monkeypatch):
-    """It needs no library for SSIM, which would take longest to install."""
+    """The demonstration works without scikit-image, the package for SSIM, which takes longest to install."""
     monkeypatch.setitem(sys.modules, "skimage", None)
     options = ("--size", 16, "--spp", 1, "--runs", 2, "--reference-spp", 2, "--adapter", untrained)
     code, out, err = nma("demo", "-o", tmp_path / "demo.png", *options)

@@ -1,4 +1,4 @@
-"""`nma evaluate` prints figures for people and for programs."""
+"""`nma evaluate` prints its figures as a table, or as JSON for other programs."""
 
 import json
 
@@ -31,5 +31,5 @@ def test_simulate_and_evaluate_print_one_json_object_and_nothing_else(nma, untra
 
 
 def test_json_has_no_infinity():
-    """The PSNR of equal tables is infinite."""
+    """JSON has null in place of infinity, which is the PSNR of two equal tables."""
     assert _finite({"psnr": float("inf"), "ae": 0.0}) == {"psnr": None, "ae": 0.0}

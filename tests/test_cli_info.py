@@ -1,7 +1,7 @@
-"""`nma info` shows what a weights file says about itself."""
+"""`nma info` shows the metadata of a weights file."""
 
 
-def test_the_loss_of_training_is_told_from_the_error_of_the_adapter(nma):
+def test_info_says_that_the_training_loss_includes_noise_of_the_tables(nma):
     _, out, _ = nma("info", "layered3-5x64")
     assert "log_loss_of_last_1000_steps  .01036" in out
     assert "holds their noise too" in " ".join(out.split())

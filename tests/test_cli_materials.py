@@ -1,4 +1,4 @@
-"""`nma materials` lists the named materials, and shows one of them."""
+"""`nma materials` lists the named materials. `nma materials NAME` shows a single material."""
 
 import json
 
@@ -18,14 +18,14 @@ TEXTURED = (
 
 @pytest.fixture
 def textured(tmp_path):
-    """A material file with a packed image."""
+    """The path of a material file, one of whose parameters is a channel of a packed image."""
     Image.fromarray(np.full((4, 4, 3), (255, 25, 0), np.uint8)).save(tmp_path / "orm.png")
     (tmp_path / "worn.toml").write_text(TEXTURED)
     return tmp_path / "worn.toml"
 
 
 @pytest.mark.parametrize("name", materials.names())
-def test_json_has_the_exact_numbers_of_a_material_in_the_order_of_its_class(nma, name):
+def test_json_has_the_exact_parameters_of_a_material_in_the_order_of_its_class(nma, name):
     code, out, _ = nma("materials", name, "--json")
     facts, material = json.loads(out), materials.load(name)
     assert code == 0
@@ -49,7 +49,7 @@ def test_a_textured_material_has_files_in_place_of_numbers(nma, textured):
     assert facts["values"]["sigma_t"] == 0.5
 
 
-def test_a_material_is_shown_as_a_table_whatever_its_title(nma, textured):
+def test_a_material_with_brackets_in_its_title_is_shown_as_a_table(nma, textured):
     code, out, err = nma("materials", textured)
     assert code == 0, err
     assert "Worn [/b] gold" in out and "orm.png" in out

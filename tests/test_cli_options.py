@@ -1,4 +1,4 @@
-"""Options are checked where they are declared, for every command alike."""
+"""The options of all commands: declared bounds and choices, and refusals of other values."""
 
 from typing import get_args, get_type_hints
 
@@ -16,13 +16,13 @@ NUMBERS = list(numbers())
 IDS = [f"{'-'.join(words)}{option}" for words, option, _ in NUMBERS]
 
 
-def test_every_command_is_looked_at():
+def test_the_tests_find_every_command():
     assert {("render",), ("demo",), ("library", "encode"), ("mitsuba", "build")} <= {w for w, _ in commands()}
     assert len(NUMBERS) > 30
 
 
 @pytest.mark.parametrize(("words", "option", "info"), NUMBERS, ids=IDS)
-def test_every_number_has_bounds_and_what_lies_outside_is_wrong_usage(nma, words, option, info):
+def test_every_number_has_bounds_and_a_number_outside_is_wrong_usage(nma, words, option, info):
     assert info.min is not None and info.max is not None
     for value in (info.min - 1, 2 * info.max + 1, "nan"):
         code, out, err = nma(*words, option, value)
@@ -30,7 +30,7 @@ def test_every_number_has_bounds_and_what_lies_outside_is_wrong_usage(nma, words
         assert f"'{option}'" in err and "Traceback" not in err
 
 
-def test_words_to_choose_from_are_those_that_are_declared():
+def test_the_choices_of_options_are_the_values_that_the_code_declares():
     hints = get_type_hints(Recipe)
     assert options.TARGETS == get_args(hints["target"]) == tuple(TARGETS)
     assert options.POINTS_LAWS == get_args(hints["points_law"])
@@ -54,7 +54,7 @@ def test_words_to_choose_from_are_those_that_are_declared():
     ],
     ids=lambda words: "".join(words[:1] + words[-2:-1]),
 )
-def test_words_that_are_none_of_these_are_wrong_usage(nma, tmp_path, monkeypatch, words):
+def test_an_unknown_choice_is_wrong_usage(nma, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     code, out, err = nma(*words)
     assert (code, out) == (2, "")
@@ -79,8 +79,8 @@ def test_words_that_are_none_of_these_are_wrong_usage(nma, tmp_path, monkeypatch
     ],
     ids=lambda given: given if isinstance(given, str) else given[0],
 )
-def test_outputs_are_called_as_what_reads_them_wants(nma, tmp_path, monkeypatch, words, ending):
-    """Once, weights were written to `x.bin` after all the work, and no command took them."""
+def test_an_output_must_have_the_ending_of_its_format(nma, tmp_path, monkeypatch, words, ending):
+    """A command refuses an output with another ending before its work, because no command would read that file."""
     monkeypatch.chdir(tmp_path)
     for name in ("x", "x.bin"):
         code, out, err = nma(*words, "-o", name)
@@ -99,7 +99,7 @@ def test_the_version_is_printed(nma):
     assert nma("--version") == (0, f"nma {package.__version__}\n", "")
 
 
-def test_an_interrupted_command_says_so(nma, monkeypatch):
+def test_an_interrupted_command_says_how_to_continue(nma, monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 

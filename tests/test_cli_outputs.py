@@ -1,4 +1,4 @@
-"""Commands try their outputs before they begin. If something cannot be written, they end with one line."""
+"""Commands check their outputs before they begin. If an output cannot be written, they fail with one line."""
 
 import errno
 import sys
@@ -17,7 +17,7 @@ FUNCTIONS = dict(commands())
 
 
 def arguments(words, output):
-    """The command with this output. The files that it would read do not exist."""
+    """Returns the words of the command with this output. The files that the command would read do not exist."""
     given = []
     for name, _, info in parameters(FUNCTIONS[words]):
         if isinstance(info, ArgumentInfo):
@@ -44,7 +44,7 @@ def bad(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_all_commands_that_write_are_known():
+def test_the_tests_find_all_commands_that_write():
     names = {words[0] for words in WRITING}
     assert {"render", "compare", "demo", "simulate", "dataset", "train", "fit", "principled"} <= names
     assert {("library", "encode"), ("library", "extract"), ("train-library",)} <= set(WRITING)
@@ -53,7 +53,7 @@ def test_all_commands_that_write_are_known():
 @pytest.mark.parametrize("output", [".", "..", "/", ""])
 def test_a_folder_is_no_output(nma, bad, output):
     for words in WRITING:
-        if words != ("dataset",):  # its output is a folder
+        if words != ("dataset",):  # the output of `nma dataset` is a folder
             code, out, err = nma(*arguments(words, output))
             assert code in (1, 2) and out == "", words
             assert "cannot be written" in err or "must end in" in err, words
@@ -81,7 +81,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
     assert [path.name for path in bad.iterdir()] == ["file"]
 
 
-def test_errors_of_the_system_elsewhere_are_one_line(nma, monkeypatch):
+def test_errors_of_the_operating_system_are_one_line(nma, monkeypatch):
     def no_folder():
         raise PermissionError(errno.EACCES, "Permission denied", "/locked/cache")
 
@@ -108,7 +108,7 @@ def test_too_little_memory_is_one_line(nma, monkeypatch, error):
 
 
 @pytest.mark.parametrize("words", [("demo",), ("compare", "gold-red-lacquer"), ("compare", "a.exr", "b.exr")])
-def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, monkeypatch, words):
+def test_missing_packages_are_reported_before_rendering(nma, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     write_exr("a.exr", np.zeros((16, 16, 3)))
     write_exr("b.exr", np.zeros((16, 16, 3)))
@@ -130,7 +130,7 @@ def test_missing_extras_are_missed_before_anything_is_rendered(nma, tmp_path, mo
         (("compare", "gold-red-lacquer", "--adapter", "no-such"), "no-such"),
     ],
 )
-def test_what_fails_in_the_end_fails_at_once(nma, tmp_path, monkeypatch, words, message):
+def test_a_faulty_option_fails_before_rendering(nma, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     _renders_nothing(monkeypatch)
     code, out, err = nma(*words)

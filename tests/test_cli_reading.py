@@ -1,4 +1,4 @@
-"""What arguments name: materials, their changes, and sources of one material."""
+"""The option `--set` of commands: its text becomes a change of a material."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ from nma.errors import MaterialError
         ),
     ],
 )
-def test_set_says_what_a_material_file_does(text, change):
+def test_the_text_of_set_becomes_the_value_of_a_material_file(text, change):
     assert change_of(text) == change
 
 

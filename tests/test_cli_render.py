@@ -1,4 +1,4 @@
-"""`nma render` writes pictures of materials, of scenes and of adapters that know one material."""
+"""`nma render` writes pictures of materials, of scenes, and of adapters of one material."""
 
 import pytest
 
@@ -37,7 +37,7 @@ def test_render_writes_exr_and_png(nma, untrained, tmp_path, model):
 
 
 @pytest.mark.parametrize("bsdf", ["nma", "layered"])
-def test_render_knows_the_bsdfs_in_a_scene_file(nma, untrained, tmp_path, bsdf):
+def test_render_loads_our_bsdfs_in_a_scene_file(nma, untrained, tmp_path, bsdf):
     scene = tmp_path / "scene.xml"
     text = SCENE.replace('type="BSDF">', f'type="{bsdf}">')
     if bsdf == "nma":

@@ -1,4 +1,4 @@
-"""`nma simulate` writes reference files, and goes on where it was stopped."""
+"""`nma simulate` writes reference files, and resumes after an interruption."""
 
 import errno
 import shutil
@@ -11,7 +11,7 @@ from nma.table import Tables
 
 
 def test_paths_are_printed_as_they_are(nma, tmp_path):
-    """They are not broken, and their brackets are no markup."""
+    """A printed path has no line breaks, and its brackets are not read as markup."""
     path = tmp_path / "a folder [bold] of {many} letters in its name" / ("n" * 60 + "[/x].npz")
     code, _, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", path)
     assert code == 0
@@ -37,7 +37,7 @@ def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, mo
     assert nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")[0] == 0
 
 
-def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
+def test_a_damaged_part_is_simulated_again(nma, tmp_path):
     output = tmp_path / "x.npz"
     run = ("simulate", "--draw", 2, "--walks", 1600, "--seed", 5, "-o")
     assert nma(*run, tmp_path / "right.npz")[0] == 0
@@ -51,8 +51,11 @@ def test_a_damaged_part_is_simulated_anew(nma, tmp_path):
     assert not parts.exists()
 
 
-def test_parts_that_another_run_takes_away_do_no_harm(nma, tmp_path, monkeypatch):
-    """Two runs write one output. One ends and removes the folder of parts, just before the other renames its file."""
+def test_a_run_survives_if_another_run_removes_its_parts(nma, tmp_path, monkeypatch):
+    """Two runs write the same output. One ends and removes the folder of parts just before the other renames a part.
+
+    A failure means that the other run stops with an error.
+    """
     replace, taken = Path.replace, []
 
     def without_folder(self, target):

@@ -1,6 +1,6 @@
-"""Our BSDFs inside Mitsuba's that combine others: pictures are the linear combination of pictures, in any integrator.
+"""Our BSDFs inside Mitsuba's composite BSDFs: the picture of a composite is the weighted sum of its parts' pictures.
 
-One sheet of small cells under the same sky is rendered for each integrator, one cell for each BSDF in each composite.
+Each integrator renders one sheet of small cells under the same sky, with one cell for each BSDF in each composite.
 """
 
 import gc
@@ -18,9 +18,9 @@ from nma.render.values_bsdf import bsdf_of
 from nma.sources.coating import Coating
 
 COLUMNS = 8
-PIXELS = 10  # along a cell's side, its border included
+PIXELS = 10  # pixels along the side of a cell, with its border
 SEEDS, SPP = 4, 48
-FALSE_ALARM = 0.001  # of a whole sheet
+FALSE_ALARM = 0.001  # the false-alarm rate of all cells of a sheet together
 WEIGHT, OPACITY = 0.4, 0.7
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
 
@@ -38,12 +38,12 @@ INTEGRATORS = {
 @pytest.fixture(autouse=True)
 def _variant():
     nma.render.use("llvm_ad_rgb")
-    gc.collect()  # Dr.Jit records the BSDFs of scenes that wait for it, too
+    gc.collect()  # Dr.Jit would also record the BSDFs of old scenes that are not collected yet
 
 
 @pytest.fixture(scope="module")
 def bsdfs(tmp_path_factory):
-    """Descriptions of all kinds of our BSDFs."""
+    """Descriptions of our BSDFs, one of each kind."""
     nma.render.use("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("weights")
     random_adapter(hidden="1x4").save(folder / "small.safetensors")
@@ -77,7 +77,8 @@ def normalmap(bsdf):
     return {"type": "normalmap", "normalmap": bitmap_texture(up), "a": bsdf}
 
 
-# What a composite makes of a picture of the BSDF, of the diffuse one, and of none.
+# For each composite: how to make it from a BSDF, and the weights of three pictures in its picture. They are the
+# pictures of the BSDF, of the diffuse BSDF, and of the bare sky.
 COMPOSITES = {
     "blendbsdf": (blend, (1 - WEIGHT, WEIGHT, 0.0)),
     "mask": (mask, (OPACITY, 0.0, 1 - OPACITY)),
@@ -89,24 +90,28 @@ COMPOSITES = {
         (OPACITY * (1 - WEIGHT), OPACITY * WEIGHT, 1 - OPACITY),
     ),
 }
-# Composites of every BSDF; the others are compiled for those that keep something between calls or walk.
+# Every BSDF is tested in COMMON composites. To save compiling, only the BSDFs IN_ALL are tested in all composites:
+# one keeps results between calls, the other simulates walks.
 COMMON = ("blendbsdf", "nested")
 IN_ALL = ("nma, textured", "layered")
 
 
 def pairs(bsdfs):
-    """The BSDFs and composites that have a cell."""
+    """Lists the pairs of a BSDF and a composite that have a cell."""
     return [(b, c) for b in bsdfs for c in COMPOSITES if c in COMMON or b in IN_ALL]
 
 
 def cells(bsdfs):
-    """Names and descriptions of all cells: the diffuse one, none, each BSDF alone, and the composites."""
+    """Returns the BSDFs of all cells by name: the diffuse one, a transparent one, our BSDFs, and the composites."""
     sheet = {"diffuse": DIFFUSE, "none": {"type": "mask", "opacity": 0.0, "a": DIFFUSE}} | bsdfs
     return sheet | {f"{b} in {c}": COMPOSITES[c][0](bsdfs[b]) for b, c in pairs(bsdfs)}
 
 
 def sheet_scene(sheet, integrator):
-    """Flat cells, all seen at 45 degrees, under a sky with a bright patch: pixels of a cell have one distribution."""
+    """Loads a scene of flat cells, all seen at 45 degrees, under a sky with a bright patch.
+
+    View and light are the same for all cells and pixels. So all pixels of a cell have the same distribution.
+    """
     rows = -(-len(sheet) // COLUMNS)
     sky = np.full((8, 16, 3), 0.3, np.float32)
     sky[1:3, 4:7] = [1.2, 0.9, 0.6]
@@ -146,7 +151,7 @@ def sheet_scene(sheet, integrator):
 
 
 def inner_pixels(scene, count):
-    """For each cell the pixels that lie in it wholly, a mask (height, width)."""
+    """Returns one mask (height, width) per cell, which marks the pixels that lie completely inside the cell."""
     width, height = scene.sensors()[0].film().size()
     shapes = {shape.id(): shape for shape in scene.shapes()}
     corners = []
@@ -163,7 +168,7 @@ def inner_pixels(scene, count):
 
 
 def measured(scene, names):
-    """Mean and its variance (channels,) of every cell, over its pixels and several seeds."""
+    """Returns the mean (channels,) of every cell over its pixels and several seeds, and the variance of this mean."""
     pictures = np.stack([np.array(mi.render(scene, spp=SPP, seed=seed), np.float64) for seed in range(SEEDS)])
     found = {}
     for name, inside in zip(names, inner_pixels(scene, len(names)), strict=True):
@@ -174,7 +179,7 @@ def measured(scene, names):
 
 
 def scores(found, bsdfs):
-    """The difference of every composite from the combination, in standard deviations: name -> (channels,)."""
+    """Returns by how many standard deviations each composite differs from the weighted sum: name -> (channels,)."""
     result = {}
     for name, composite in pairs(bsdfs):
         weights = COMPOSITES[composite][1]
@@ -183,7 +188,7 @@ def scores(found, bsdfs):
         expected = sum(w * m for w, (m, _) in zip(weights, terms, strict=True))
         spread = variance + sum(w * w * v for w, (_, v) in zip(weights, terms, strict=True))
         z = (mean - expected) / np.sqrt(spread + (1e-4 * expected) ** 2 + 1e-14)
-        # Channels beyond the picture are albedos, for which Mitsuba's `mask` has no rule.
+        # The channels after the first three are albedos. Mitsuba's `mask` does not weigh albedos.
         result[f"{name} in {composite}"] = z[:3] if "mask" in composite or composite == "nested" else z
     return result
 
@@ -199,15 +204,18 @@ def test_composites_are_linear_combinations(bsdfs, integrator):
     off = {name: z.round(1) for name, z in differences.items() if np.abs(z).max() > limit}
     assert not off, (limit, off)
     if integrator == "direct, lights":
-        return  # such pictures of narrow lobes are too noisy to show more than that they are made
-    # A bias of 3 % would be seen, in nearly all cells.
+        return  # with light sampling alone, pictures of narrow lobes are too noisy for the check below
+    # The test detects a bias of 3 %, in nearly all cells.
     seen = [(0.03 * m / np.sqrt(v + 1e-14))[:3] for m, v in (found[name] for name in bsdfs)]
     assert np.median(seen) > limit
 
 
 @pytest.mark.parametrize("name", ("nma, textured", "nma, anisotropic", "layered"))
-def test_composites_render_where_value_and_sample_are_asked_apart(bsdfs, name):
-    """As `direct` does; the tests above say what is seen, this one that there is a picture at all."""
+def test_composites_render_in_the_integrator_direct(bsdfs, name):
+    """`direct` evaluates and samples a BSDF in separate calls, and the picture is finite and not black.
+
+    This is a fast check. The test above compares the values.
+    """
     sheet = {"mask": mask(bsdfs[name]), "blend": blend(bsdfs[name])}
     picture = np.array(mi.render(sheet_scene(sheet, INTEGRATORS["direct"]), spp=4))
     assert np.isfinite(picture).all()
@@ -217,7 +225,7 @@ def test_composites_render_where_value_and_sample_are_asked_apart(bsdfs, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_composites_can_be_frozen(bsdfs, integrator):
-    """Recorded once by `dr.freeze`, the sheet is the same picture."""
+    """`dr.freeze` records the rendering of the sheet once, and the frozen function returns the same picture."""
     bsdfs = {name: bsdfs[name] for name in ("nma, textured", "layered", "values")}
     loaded = sheet_scene(cells(bsdfs), INTEGRATORS[integrator])
     film = {"type": "hdrfilm", "width": 32, "height": 32}

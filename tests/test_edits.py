@@ -1,4 +1,4 @@
-"""Edits of our BSDFs in Mitsuba: they show at once, compile nothing, are checked, and work in frozen functions."""
+"""Edits of our BSDFs take effect at once, compile no kernel, are checked, and work inside frozen functions."""
 
 import gc
 import os
@@ -20,14 +20,14 @@ nma.render.use("llvm_ad_rgb")
 @pytest.fixture(autouse=True)
 def _variant():
     nma.render.use("llvm_ad_rgb")
-    # Frozen functions and errors are in cycles with their scenes. Were these collected while another is recorded,
-    # Mitsuba would go on to call the BSDFs that are gone.
+    # Frozen functions and errors form reference cycles with their scenes. We collect these scenes now: if Python
+    # collected one while Dr.Jit records another, Mitsuba would call BSDFs that no longer exist.
     gc.collect()
 
 
 @pytest.fixture(scope="module")
 def adapter(tmp_path_factory):
-    """A small adapter, quick to compile."""
+    """The description of a BSDF `nma` with a small adapter, which compiles quickly."""
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     random_adapter(hidden="1x8").save(path)
     return {"type": "nma", "adapter": str(path), "material": "frosted-silver", "clamp": True}
@@ -42,7 +42,7 @@ def rgb(*values):
 
 
 def scene(bsdf, integrator="path", **more):
-    """A ball under a uniform sky."""
+    """Loads a scene of a ball under a uniform sky."""
     film = {"type": "hdrfilm", "width": 6, "height": 6, "pixel_format": "rgb", "component_format": "float32"}
     return mi.load_dict(
         {
@@ -62,7 +62,7 @@ def picture(loaded, spp=16, seed=0):
 
 @pytest.fixture
 def compiled():
-    """Runs a function and returns how many kernels were compiled for it."""
+    """A function that runs its argument and returns how many kernels that compiled."""
 
     def count(function):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -94,7 +94,7 @@ def test_an_edit_compiles_nothing(adapter, compiled, kind):
         params.update()
         return picture(loaded)
 
-    edit((0.5, 0.4, 0.3))  # the edit's own small kernels
+    edit((0.5, 0.4, 0.3))  # the first edit compiles small kernels of its own
     after = []
     assert compiled(lambda: after.append(edit((0.9, 0.1, 0.2)))) == 0
     assert np.abs(after[0] - before).max() > 0.01
@@ -118,7 +118,7 @@ def test_materials_of_one_structure_share_a_kernel(adapter, compiled, kind):
 
 
 def test_loading_many_materials_leaves_memory_flat():
-    """200 of them, with an adapter of 19,000 numbers, take less than 10 MB."""
+    """200 materials take less than 10 MB, although their adapter has 19,000 weights. So they share the weights."""
     memory = lambda: int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")  # noqa: E731
     make = lambda: mi.load_dict({"type": "nma", "material": "gold-red-lacquer"})  # noqa: E731
     kept = [make() for _ in range(3)]
@@ -129,8 +129,8 @@ def test_loading_many_materials_leaves_memory_flat():
 
 
 @pytest.mark.parametrize("kind", [*BESIDE, "blendbsdf"])
-def test_frozen_functions_follow_edits(adapter, kind):
-    """Edits from outside and from inside; the recorded kernels run again."""
+def test_frozen_functions_render_edited_values(adapter, kind):
+    """A frozen function renders edits that were made outside or inside of it, with at most two recordings."""
     blend = {"type": "blendbsdf", "weight": 0.3, "a": adapter | {"alpha_bottom": TEXTURE}, "b": LAYERED}
     loaded = scene(blend if kind == "blendbsdf" else BESIDE[kind](adapter))
     params = mi.traverse(loaded)
@@ -157,7 +157,11 @@ def test_frozen_functions_follow_edits(adapter, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ("plain", "textured"))
 def test_frozen_functions_see_derivatives_of_numbers_set_before(adapter, kind):
-    """They get the curves of a plain material and the number that these were made from side by side."""
+    """Derivatives by an input that was set before the call are the same in a frozen function, within 2 %.
+
+    The curves of a plain material are computed before the call, so that the frozen function receives both the input and
+    the curves.
+    """
 
     def derive(loaded, params):
         dr.backward(dr.mean(mi.render(loaded, params, spp=64), axis=None))
@@ -195,12 +199,12 @@ WRONG_AT_LOAD = {
 
 
 @pytest.mark.parametrize("kind", WRONG_AT_LOAD)
-def test_what_was_refused_does_not_stop_other_scenes(adapter, kind):
-    """Although the error, which notebooks keep, has a hold on it."""
+def test_a_refused_bsdf_does_not_stop_other_scenes(adapter, kind):
+    """Other scenes render although the error keeps a reference to the refused BSDF. Notebooks keep such errors."""
     expected = picture(scene(LAYERED))
     with pytest.raises(RuntimeError) as error:
         mi.load_dict(WRONG_AT_LOAD[kind](adapter))
-    # Films add up in any order.
+    # A film adds samples in any order, so that pictures differ by rounding.
     np.testing.assert_allclose(picture(scene(LAYERED)), expected, rtol=1e-5)
     assert error.value.__traceback__ is not None
 
@@ -236,8 +240,8 @@ def test_wrong_edits_are_refused_and_not_rendered(adapter, kind, what):
 
 
 @pytest.mark.parametrize("kind", BESIDE)
-def test_of_several_edits_the_wrong_ones_are_undone(adapter, kind):
-    """All of them, while the others show."""
+def test_of_several_edits_only_the_wrong_ones_are_undone(adapter, kind):
+    """If an update has several edits, all wrong ones are undone, and all correct ones take effect."""
     bsdf = BESIDE[kind](adapter)
     bsdf = bsdf if "layered" in kind else bsdf | {"clamp": False}
     loaded = scene(bsdf)
@@ -252,8 +256,11 @@ def test_of_several_edits_the_wrong_ones_are_undone(adapter, kind):
     np.testing.assert_allclose(picture(loaded), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_what_frozen_functions_set_is_rendered_within_bounds(adapter):
-    """Afterwards too: the picture is that of the nearest value, whoever renders."""
+def test_values_that_frozen_functions_set_are_clamped(adapter):
+    """A value beyond its bounds that a frozen function sets renders as the nearest allowed value.
+
+    That holds inside the frozen function, and for later renderings outside of it.
+    """
     loaded = scene(adapter | {"clamp": False})
     params = mi.traverse(loaded)
 
@@ -271,14 +278,14 @@ def test_what_frozen_functions_set_is_rendered_within_bounds(adapter):
 
 
 def shared_key(params, leaf):
-    """The name under which Mitsuba shows the shared texture: that of whoever it met first."""
+    """Returns the key of the shared texture in `params`. Mitsuba names it by the first object that uses it."""
     (key,) = (key for key in params.keys() if key.endswith(f".{leaf}") and "sky" not in key)  # noqa: SIM118
     return key
 
 
 @pytest.mark.parametrize("kind", ("nma", "layered"))
 def test_edits_of_shared_textures_show_and_are_checked(adapter, kind):
-    """Mitsuba tells one of the objects that share a texture of its edit, and here it is not ours."""
+    """A BSDF sees and checks edits of a shared texture, although Mitsuba notifies only the other object that has it."""
     shared = {"type": "ref", "id": "shared"}
     first = {"type": "sphere", "center": [0, 0, -9], "bsdf": {"type": "diffuse", "reflectance": shared}}
     colours = ([0.1, 0.5, 0.9], [0.9, 0.1, 0.1])
@@ -302,7 +309,7 @@ def test_edits_of_shared_textures_show_and_are_checked(adapter, kind):
         params[key] = kind_of(np.full((2, 2, 3), np.nan, np.float32)) if leaf == "data" else kind_of(np.nan)
 
         def update_and_render(loaded=loaded, params=params):
-            params.update()  # tells the one or the other
+            params.update()  # Mitsuba notifies only one of the two objects
             picture(loaded)
 
         refused(update_and_render, "albedo")
@@ -323,7 +330,10 @@ def test_shared_constants_have_gradients(adapter):
 @pytest.mark.parametrize("clamp", (False, True))
 @pytest.mark.parametrize("textured", (False, True))
 def test_values_on_a_bound_have_gradients(adapter, clamp, textured):
-    """Black texels learn: on its lower bound a parameter has the derivative that it has beside it."""
+    """The derivative by a parameter on its lower bound is the derivative just above it, within 5 %.
+
+    A failure means that an optimisation cannot change black texels.
+    """
     gradients = []
     for value in (0.0, 1e-3):
         sigma_t = bitmap_texture(np.full((2, 2, 1), value)) if textured else value

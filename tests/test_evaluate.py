@@ -1,4 +1,4 @@
-"""Figures of merit of tables, and the adapter's own tables against far finer integration."""
+"""Evaluation: figures of merit follow their formulas, and tables of adapters agree with far finer integration."""
 
 import json
 import math
@@ -38,7 +38,7 @@ BLENDS = {
 
 
 def constant(blend, slope=0.0):
-    """An adapter whose target is `blend`, or turns from it towards another as cos(theta_i) moves away from 1 / 2."""
+    """Returns an adapter whose target is `blend`. With a slope, raw outputs change linearly with cos(theta_i)."""
     raw = np.array(target.encode(blend), np.float32)
     change = slope * np.random.default_rng(1).standard_normal(len(raw)).astype(np.float32)
     return Adapter(
@@ -48,19 +48,22 @@ def constant(blend, slope=0.0):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Integration with few points, for what does not need to be exact."""
+    """Integrates with few directions, for tests that do not depend on the exact values."""
     monkeypatch.setattr(adapters, "_DIRECTIONS", 4)
 
 
 @cache
 def halves(name, slope):
-    """Two independent tables of an adapter, as an evaluation makes them."""
+    """Returns two independent tables of an adapter, made as an evaluation makes them."""
     adapter = constant(BLENDS[name], slope)
     return [tabulate_adapter(adapter, PARAMS[:1], shift=s)[0] for s in (0.0, 0.5)]
 
 
 def fine_means(adapter, bins, points=1 << 11, repeats=6):
-    """Means over `bins` (n, 3) from many crowded points, the target at each one's own wi; and their standard errors."""
+    """Returns the means over `bins` (n, 3) and their standard errors, both (n, 3).
+
+    The means are over many points, which concentrate near peaks. Each point prepares the adapter for its own wi.
+    """
     Float = dr.auto.Float
     means = []
     for repeat in range(repeats):
@@ -76,7 +79,7 @@ def fine_means(adapter, bins, points=1 << 11, repeats=6):
 
 
 def near_mirror():
-    """Bins around the mirror direction, where narrow lobes are, in every third row."""
+    """Returns the bins (n, 3) around the mirror direction, in every third row. Narrow lobes lie there."""
     return np.array(
         [
             (i, o, p)
@@ -89,15 +92,19 @@ def near_mirror():
 
 
 def elsewhere(n):
-    """Some of the others."""
+    """Returns at most n random bins (m, 3) that are not around the mirror direction."""
     bins = np.random.default_rng(2).integers(0, 40, (n, 3))
     return bins[(np.abs(bins[:, 0] - bins[:, 1]) > 1) | (bins[:, 2] < 37)].astype(float)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slope"), [*((name, 1.0) for name in BLENDS), ("alpha .001", 0.0)])
-def test_the_stated_error_of_integration_is_honest(name, slope):
-    """The log loss of two estimates' mean against fine integration, where lobes are sharp and where they are not."""
+def test_the_stated_error_of_integration_covers_the_actual_error(name, slope):
+    """The actual log loss of the mean of two tables is at most 1.6 times the stated one plus 3e-5.
+
+    Fine integration gives the truth, around the mirror direction and elsewhere. A failure means that an evaluation
+    claims more accuracy than it has.
+    """
     adapter = constant(BLENDS[name], slope)
     first, second = halves(name, slope)
     table = np.log1p(0.5 * (first + second))
@@ -109,7 +116,7 @@ def test_the_stated_error_of_integration_is_honest(name, slope):
         truth, error = fine_means(adapter, bins)
         actual += part * np.abs(table[at] - np.log1p(truth)).mean()
         claimed += part * stated[at].mean()
-        # The truth is known much better than what is judged by it.
+        # The error of the fine integration is much smaller than the errors that it judges.
         assert part * np.mean(error / (1.0 + truth)) < 5e-5
     assert actual < 1.6 * claimed + 3e-5
     assert claimed < 2e-4
@@ -118,7 +125,10 @@ def test_the_stated_error_of_integration_is_honest(name, slope):
 
 @pytest.mark.parametrize("name", ("alpha .001", "coats of .001 over paint"))
 def test_albedos_are_those_of_the_target(name):
-    """2 pi times the mean of each row against the target's own samples, by Z-test."""
+    """The albedo of a row, 2 pi times its mean, is the mean weight of samples of the target (Z-test).
+
+    The false-alarm rate is `FALSE_ALARM` over all rows together; seeds are fixed.
+    """
     n = 1 << 14
     rows = [0, 1, 7, 20, 38, 39]
     found = 2.0 * math.pi * halves(name, 0.0)[0].mean(axis=(1, 2))[rows, 0]
@@ -136,7 +146,7 @@ def test_albedos_are_those_of_the_target(name):
 
 
 @pytest.mark.usefixtures("coarse")
-def test_tables_are_repeatable_and_independent_of_company():
+def test_a_table_does_not_depend_on_the_materials_beside_it():
     adapter = constant(BLENDS["alpha .01"], 1.0)
     together = tabulate_adapter(adapter, PARAMS)
     assert together.shape == (3, *ISOTROPIC.shape)
@@ -165,7 +175,7 @@ def test_an_adapter_agrees_with_its_own_table():
 
 
 @pytest.mark.usefixtures("coarse")
-def test_an_evaluation_is_json_and_says_what_it_assumes():
+def test_an_evaluation_is_json_and_says_that_errors_are_estimated():
     adapter = constant(BLENDS["alpha .1"])
     tables = 1.1 * tabulate_adapter(adapter, PARAMS[:2])
     done = []
@@ -178,7 +188,7 @@ def test_an_evaluation_is_json_and_says_what_it_assumes():
     for figure in metrics.FIGURES:
         assert result.mean[figure] == pytest.approx(np.mean([m[figure] for m in result.materials]))
     assert result.mean["noise_floor"] > 0.0
-    # A tenth of the albedo, but for the floor that noise makes.
+    # The reference is 10 % brighter, so that the albedo error is near a tenth of the albedo.
     assert result.mean["albedo_error"] == pytest.approx(0.1 * 0.6, rel=0.15)
 
 
@@ -193,7 +203,10 @@ def test_references_that_cannot_be_compared_are_refused():
 
 @pytest.mark.usefixtures("coarse")
 def test_materials_beyond_the_training_range_are_refused_or_clamped():
-    """Not silently judged by what the network happens to say there."""
+    """An evaluation refuses a parameter beyond the training range, or clamps it on request.
+
+    It never judges an adapter by its extrapolation without a word.
+    """
     layers = [
         (
             np.zeros((23, 14), np.float32),
@@ -222,7 +235,7 @@ def test_an_adapter_of_one_material_is_not_compared_with_another():
 
 
 def test_figures_are_their_formulas():
-    """Two bins of two rows, by hand."""
+    """The figures of a table of two rows and two bins equal values that are computed by hand."""
     a = np.zeros((2, 1, 2, 3))
     b = np.zeros((2, 1, 2, 3))
     a[0, 0, :, :] = [[0.2] * 3, [0.4] * 3]
@@ -237,7 +250,7 @@ def test_figures_are_their_formulas():
     assert found["mape"] == pytest.approx((0.1 / (0.1 + eps) + 0.1 / (0.5 + eps) + 1.0 / (1.0 + eps)) / 4)
     assert found["mrse"] == pytest.approx((0.01 / (0.01 + eps) + 0.01 / (0.25 + eps) + 1.0 / (1.0 + eps)) / 4)
     assert found["psnr"] == pytest.approx(10 * math.log10(1.0 / ((0.01 + 0.01 + 1.0) / 4)))
-    # Rows: 2 pi (.3 - .3) and 2 pi (0 - .5).
+    # The albedos of the two rows differ by 2 pi (.3 - .3) and 2 pi (0 - .5).
     assert found["albedo_error"] == pytest.approx(math.pi * 0.5)
     assert found["noise_floor"] == 0.0
     assert set(found) == set(metrics.FIGURES)
@@ -246,18 +259,21 @@ def test_figures_are_their_formulas():
 
 @pytest.mark.parametrize("scale", (1e-4, 0.01, 0.3, 2.0))
 def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
-    """Against Monte Carlo: from noise far below the values to noise beyond them, where the logarithm bends."""
+    """The noise floor equals a Monte Carlo estimate of this loss, from low noise to noise larger than the values."""
     rng = np.random.default_rng(4)
     b = rng.exponential(0.3, (500,))
     error = scale * rng.uniform(0.0, 1.0, 500)
     noise = np.maximum(b + error * rng.standard_normal((20_000, 500)), -0.999)
     expected = np.abs(np.log1p(noise) - np.log1p(b)).mean()
-    # Sixteen values for each sign are exact in the linear case, and near enough in the others.
+    # The quadrature of 16 values per sign is exact if the logarithm is linear, and close enough otherwise.
     assert noise_floor(b, error) == pytest.approx(expected, rel=0.004 if scale < 1.0 else 0.03)
 
 
-def test_counted_errors_are_those_of_whole_walks():
-    """The spread of tables whose walks all have throughput 1: a binomial number in each bin, divided as in eq. 9."""
+def test_counting_errors_are_exact_for_walks_of_throughput_1():
+    """The stated error is the standard deviation of tables whose walks all have throughput 1, within 5 %.
+
+    The count of walks in a bin is then binomial, and eq. 9 divides it.
+    """
     rows, walks, omega = 4, 4_000_000, 2.0 * math.pi / 100
     chance = np.array([0.001, 0.01, 0.05])
     per_row = walks // rows

@@ -1,4 +1,4 @@
-"""Derivatives of pictures by the source parameters of `nma`: against finite differences, and fit to find a texture."""
+"""Derivatives of pictures by the parameters of `nma` equal finite differences, and an optimisation finds a texture."""
 
 import mitsuba as mi
 import numpy as np
@@ -31,7 +31,7 @@ MATERIAL = {
     "albedo": rgb(0.8, 0.4, 0.3),
     "sigma_t": 0.7,
 }
-# A material, and its parameters with a direction in which each moves.
+# Materials, each with parameters to differentiate by, and with a direction of change for each parameter.
 CASES = {
     "plain": (
         MATERIAL,
@@ -50,8 +50,10 @@ CASES = {
 
 
 def scene(bsdf, depth, sky, beside=None):
-    """A ball on a floor of the same material under a point light, and a uniform sky of that radiance; another material
-    beside it if that is given."""
+    """Loads a scene of a ball on a floor of the same material, under a point light.
+
+    `sky` is the radiance of a uniform sky. `beside` is the material of a second ball, if given.
+    """
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}}
     look = mi.ScalarTransform4f().look_at([0.0, -3.0, 2.5], [0.0, 0.0, 0.4], [0.0, 0.0, 1.0])
     same = {"type": "ref", "id": "material"}
@@ -72,7 +74,7 @@ def scene(bsdf, depth, sky, beside=None):
 
 
 def replaced(params, key, value):
-    """Sets a parameter to these numbers, in the type that it has, and the derivative by it to zero."""
+    """Sets a parameter to `value`, converted to its type. Enables derivatives by the parameter, which start at zero."""
     kind = type(params[key])
     numbers = np.asarray(value, np.float32)
     params[key] = kind(numbers) if kind is mi.TensorXf else kind(numbers.ravel().tolist())
@@ -80,7 +82,10 @@ def replaced(params, key, value):
 
 
 def slopes(loaded, directions, step, spp, seeds):
-    """Derivatives of a picture's mean along each direction, by `prb` and by central differences: one for each seed."""
+    """Returns derivatives of the mean of a picture along each direction, by `prb` and by central differences.
+
+    Both are dictionaries of arrays (seeds,), by the keys of `directions`.
+    """
     params = mi.traverse(loaded)
     start = {key: np.array(params[key], np.float64).reshape(d.shape) for key, d in directions.items()}
     derivatives = {key: [] for key in directions}
@@ -88,7 +93,7 @@ def slopes(loaded, directions, step, spp, seeds):
         for key, value in start.items():
             replaced(params, key, value)
         params.update()
-        # The pass for derivatives draws its own numbers, here those of the pictures below.
+        # The pass for derivatives has a seed of its own. It gets the seed of the pictures below.
         picture = mi.render(loaded, params, spp=spp, seed=seeds + seed, seed_grad=seed)
         dr.backward(dr.mean(picture, axis=None))
         for key, d in directions.items():
@@ -109,7 +114,7 @@ def slopes(loaded, directions, step, spp, seeds):
 
 
 def case(name, folder):
-    """A case by its name; where the network runs at shading points, with small weights that have clear slopes."""
+    """Returns a case by its name. The textured case gets a small random adapter, whose derivatives are large."""
     bsdf, directions = CASES[name]
     if name == "textured":
         random_adapter(hidden="2x8", seed=5).save(folder / "small.safetensors")
@@ -119,7 +124,10 @@ def case(name, folder):
 
 @pytest.mark.parametrize("name", ("plain", pytest.param("textured", marks=pytest.mark.slow)))
 def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
-    """With one point light nothing is random but the place in the pixel, the same on all sides."""
+    """Derivatives equal finite differences within 1 %, for direct light from one point light.
+
+    The only random numbers are the positions in the pixels, which are the same for both. So there is no other noise.
+    """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}
     derivatives, differences = slopes(scene(bsdf, depth=2, sky=0.0), directions, 0.001, spp=16, seeds=2)
@@ -131,7 +139,10 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
-    """Sampling makes both noisy: four standard errors over 8 seeds (false alarm .007 in all, by Student's t)."""
+    """Derivatives equal finite differences within four standard errors over 8 seeds, with indirect light.
+
+    Sampling makes both noisy. The false-alarm rate is .007 in all (Student's t); seeds are fixed.
+    """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}
     derivatives, differences = slopes(scene(bsdf, depth=4, sky=0.5), directions, 0.01, spp=128, seeds=8)
@@ -139,7 +150,7 @@ def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
         found = derivatives[key]
         error = np.sqrt((found.var(ddof=1) + expected.var(ddof=1)) / 8)
         assert abs(found.mean() - expected.mean()) < 4.0 * error, key
-        # A derivative off by a half would be seen.
+        # The noise is small enough that the test detects a derivative that is 50 % off.
         assert error < 0.1 * abs(expected.mean()), key
 
 
@@ -147,7 +158,10 @@ def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("blended", (False, True), ids=("alone", "blended"))
 def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
-    """In a scene of several BSDFs, which Dr.Jit calls in scopes of their own."""
+    """Forward and backward derivatives agree within 1e-3 in a scene of several BSDFs.
+
+    Dr.Jit traces each of several BSDFs in a scope of its own, which derivatives must cross.
+    """
     bsdf, directions = case(name, tmp_path)
     within, key = (
         ("material.bsdf_0.", next(iter(directions))) if blended else ("material.", next(iter(directions)))
@@ -177,7 +191,10 @@ def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
 
 @pytest.mark.slow
 def test_optimisation_finds_a_texture():
-    """A sheet under a uniform sky, seen from above; texels are known to .02 on average and .08 at worst."""
+    """Optimisation recovers the albedo texture of a sheet under a uniform sky.
+
+    Its 27 values are off by less than .02 on average and .08 at worst.
+    """
     wanted = np.random.default_rng(2).uniform(0.1, 0.9, (3, 3, 3))
     bsdf = MATERIAL | {"sigma_t": 1.0, "albedo": bitmap_texture(np.full((3, 3, 3), 0.5))}
     look = mi.ScalarTransform4f().look_at([0.0, 0.0, 4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""The C++ runtime against the package that it repeats: the target, the network, samples, curves."""
+"""The C++ runtime computes the same as the package: the target, the network, samples and curves."""
 
 import ctypes
 import re
@@ -17,7 +17,7 @@ from nma.ops import Vec3, at_azimuth_0
 from nma.params import MEASURED
 
 CASES = 4000
-# Numbers of an instance.
+# The count of numbers per instance: its fields, and two more for the colour.
 FIELDS = len(target.Principled._fields) + 2
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -29,13 +29,13 @@ def bridge(compiler, tmp_path_factory):
 
 
 def flat(blend):
-    """(n, 14 per instance): fields of all instances, then the weights."""
+    """Converts a blend to an array (n, columns): the fields of all instances, then the weights."""
     columns = [x for p in blend.instances for x in (*p.base_color, *p[1:])]
     return np.ascontiguousarray(np.stack([*columns, *blend.weights], axis=-1))
 
 
 def cases(seed=0, count=2):
-    """Random blends and directions; in half of the pairs wo lies within the specular lobe of the first instance."""
+    """Returns random blends, wi and wo. In half of the cases wo lies in the specular lobe of the first instance."""
     rng = np.random.default_rng(seed)
     blend, wi, wo = (
         random_blend(rng, CASES, count, fades=True),
@@ -55,7 +55,7 @@ def cases(seed=0, count=2):
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 1e-4)])
 def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, bounded):
     blend, wi, wo = cases()
-    # Both see the same numbers, rounded to what the runtime works with.
+    # Both compute from the same inputs, rounded to the precision of the runtime.
     numbers, i, o = (x.astype(dtype) for x in (flat(blend), rows(wi), rows(wo)))
     found = np.zeros((CASES, 4), dtype)
     call = bridge.evaluate_float if dtype == np.float32 else bridge.evaluate_double
@@ -70,7 +70,7 @@ def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, 
 
 
 def unflat(columns):
-    """Inverse of `flat`, from its columns."""
+    """Inverts `flat`: makes a blend of two instances from its columns."""
     instances = []
     for k in range(2):
         p = columns[FIELDS * k : FIELDS * (k + 1)]
@@ -89,7 +89,7 @@ def test_samples_are_those_of_the_target(bridge):
 
 
 def rounded(layers):
-    """Matrices rounded to bfloat16: the upper halves, to nearest, ties to even."""
+    """Rounds the matrices of layers to bfloat16, to the nearest value and with ties to even."""
     bits = [np.asarray(matrix, np.float32).view(np.uint32) for matrix, _ in layers]
     halves = [((b + 0x7FFF + (b >> 16 & 1)) & 0xFFFF0000).astype(np.uint32).view(np.float32) for b in bits]
     return [(matrix, bias) for matrix, (_, bias) in zip(halves, layers, strict=True)]
@@ -118,10 +118,10 @@ def test_network_outputs_agree_on_every_instruction_set(name, compact):
     for instruction_set, outputs in found.items():
         error = np.abs(outputs - wanted) / (1.0 + np.abs(wanted))
         if instruction_set == "avx512_bf16":
-            # Eight bits of every activation.
+            # This instruction set rounds activations to the 8 significant bits of bfloat16.
             assert np.sqrt((error**2).mean()) < 0.02
             continue
-        # Inputs where the conductor's Fresnel term cancels are off by more than the network's own rounding.
+        # A few inputs have larger errors, because the conductor's Fresnel term cancels digits.
         assert np.quantile(error, 0.999) < 1e-5
         assert error.max() < 2e-4
         assert np.abs(outputs - found["portable"]).max() < 1e-4
@@ -152,13 +152,16 @@ def test_an_adapter_evaluates_like_the_package():
     for instruction_set in in_single_precision():
         loaded = Runtime("layered3-3x32", instruction_set)
         found = np.column_stack(loaded.eval_pdf(loaded.prepare(params, wi.T[2]), wi, wo))
-        # Errors of the network's outputs, 1e-5, are multiplied by sharp lobes.
+        # Narrow lobes multiply the errors of the network's outputs, which are 1e-5.
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("hidden", ([32, 32, 32], [8]))
 def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hidden):
-    """No parameters, one input, and lobes that are stretched in the plane of incidence, flattened and faded."""
+    """The values of a measured material agree within 2e-3.
+
+    Its network has one input and no parameters. Its lobes are stretched in the plane of incidence, flattened and faded.
+    """
     rng, size = np.random.default_rng(14), target.output_size(2, target.MEASURED_PARAMS)
     layers = network.init(rng, [1, *hidden, size], rng.normal(size=size))
     adapter = nma.Adapter(MEASURED, "direction", layers, 2, True, target.MEASURED_PARAMS)
@@ -174,8 +177,11 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 
-def test_curves_follow_the_network():
-    """About to the error that nma/render/curves.py states of as many nodes, 1e-4 of a value."""
+def test_curves_have_the_values_of_the_network():
+    """Values from curves agree with values from the network: the median error is below 5e-4 of a value.
+
+    That is about the error that nma/render/curves.py states for as many nodes, 1e-4.
+    """
     params, cosines = queries(8)
     wi = facing(cosines)
     u = np.random.default_rng(9).random((CASES, 3), np.float32)
@@ -213,8 +219,11 @@ def test_samples_have_the_values_and_densities_of_eval():
 
 @pytest.mark.slow
 def test_samples_follow_the_density():
-    """Chi-square tests of six materials; a correct sampler fails one of them with a chance of 1e-3. For lobes of any
-    width, and in double precision, tests/test_target_sampling.py tests the functions that this runtime repeats."""
+    """Samples of six materials follow their density (chi-square tests, false-alarm rate 1e-3 in all).
+
+    The lobes here are not narrow. tests/test_target_sampling.py tests the same functions of the package in double
+    precision and for lobes of any width.
+    """
     tests = 6
     params, cosines = queries(12)
     params, cosines = params[:tests], cosines[:tests]
@@ -225,7 +234,7 @@ def test_samples_follow_the_density():
     for k in range(tests):
 
         def alike(n, k=k):
-            """The material and its view, n times."""
+            """Returns n copies of the material and of its view direction."""
             return (np.repeat(x[k : k + 1], n, 0) for x in (materials, wi))
 
         def sample(n):
@@ -237,7 +246,7 @@ def test_samples_follow_the_density():
         assert wrong < 1e-6
 
 
-def test_albedos_are_the_means_of_samples_without_their_noise():
+def test_albedos_are_the_means_of_sample_weights_and_have_no_noise():
     params, cosines = queries(17)
     params, cosines, many = params[:10], np.linspace(0.02, 1.0, 10, dtype=np.float32), 1 << 15
     wi = facing(cosines)
@@ -253,7 +262,7 @@ def test_albedos_are_the_means_of_samples_without_their_noise():
         np.testing.assert_allclose(albedo, weights.mean(axis=0, dtype=np.float64), atol=0.02)
 
 
-def test_parameters_beyond_the_training_range_are_refused_or_moved():
+def test_parameters_beyond_the_training_range_are_refused_or_clamped():
     loaded = Runtime("layered3-3x32")
     params, cosines = queries(16)
     low, high = (x.astype(np.float32) for x in nma.LAYERED3.columns("training"))
@@ -288,7 +297,7 @@ def test_an_instruction_set_that_this_cpu_lacks_falls_back():
     assert message.value == b"no such instruction set"
 
 
-def test_an_adapter_in_memory_is_the_one_of_its_file():
+def test_an_adapter_loaded_from_memory_equals_that_from_its_file():
     loaded, data = Runtime("layered3-3x32"), weights_file("layered3-3x32").read_bytes()
     params, cosines = queries(15)
     library = loaded._c

@@ -1,4 +1,4 @@
-"""Anisotropic adapters in the C++ runtime, which look at the whole view direction, against the package."""
+"""Anisotropic adapters, whose input is the whole view direction, compute the same in C++ as in the package."""
 
 import ctypes
 import subprocess
@@ -19,7 +19,8 @@ from nma.ops import Vec3
 
 RUNTIME = Path(__file__).parent.parent / "runtime"
 CASES = 4000
-# One that stays in registers on AVX-512, one that does not, and one that pads its inputs to more than it is wide.
+# With AVX-512, the first network stays in registers and the second does not. The third has more padded inputs than
+# neurons per layer.
 NETWORKS = ("3x32", "2x64", "1x4")
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -27,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("compiler")
 
 @pytest.fixture(scope="module", params=NETWORKS)
 def case(request, tmp_path_factory):
-    """An adapter and its file."""
+    """An adapter and the path of its file."""
     adapter = random_anisotropic_adapter(request.param)
     path = tmp_path_factory.mktemp("anisotropic") / "brushed.safetensors"
     adapter.save(path)
@@ -35,23 +36,23 @@ def case(request, tmp_path_factory):
 
 
 def directions(seed):
-    """(n, 3), over the hemisphere."""
+    """Returns CASES random directions over the hemisphere, (n, 3)."""
     return rows(random_directions(np.random.default_rng(seed), CASES)).astype(np.float32)
 
 
 def outputs(adapter, wi):
-    """What the package's network returns, (n, size)."""
+    """Returns the outputs (n, size) of the network, computed by the package."""
     inputs = encoding.get(adapter.encoding)([], Vec3(*wi.T.astype(np.float64)))
     return network.forward(adapter.layers, np.stack(inputs, axis=-1))
 
 
 def none():
-    """Parameters of materials without any."""
+    """Returns parameters (n, 0), for materials without parameters."""
     return np.zeros((CASES, 0))
 
 
 def close(a, b, instruction_set):
-    """The share of rows that agree; avx512_bf16 keeps eight bits of every activation."""
+    """Returns the share of rows that agree. avx512_bf16 rounds activations to bfloat16, so it is allowed more error."""
     rounded = instruction_set == "avx512_bf16"
     return np.isclose(a, b, rtol=0.1 if rounded else 2e-3, atol=2e-2 if rounded else 1e-4).all(axis=1).mean()
 
@@ -69,7 +70,7 @@ def test_network_outputs_are_those_of_the_package(case):
             assert np.sqrt((error**2).mean()) < 0.02
         else:
             assert error.max() < 1e-5
-    # The azimuth matters by far more than that.
+    # A wrong azimuth changes the outputs far more than these errors.
     assert np.abs(turned - wanted).mean() > 0.3
 
 
@@ -87,7 +88,7 @@ def test_values_densities_and_samples_are_those_of_the_package(case):
         prepared = runtime.prepare(none(), wi)
         found = np.column_stack(runtime.eval_pdf(prepared, wi, wo))
         assert close(found, values, instruction_set) > 0.998
-        # Next to the borders of lobes a rounding chooses another one.
+        # Near the border between two lobes, rounding may choose the other lobe.
         found = np.column_stack(runtime.sample(prepared, wi, u))
         assert close(found, samples, instruction_set) > 0.998
 
@@ -147,7 +148,7 @@ def test_cosines_and_other_shapes_are_refused(case):
 
 @pytest.fixture(scope="module")
 def curves(compiler, tmp_path_factory):
-    """A program that says why it cannot make curves of an adapter."""
+    """A program that prints why it cannot make curves of an adapter."""
     folder = tmp_path_factory.mktemp("curves")
     source = folder / "curves.cpp"
     source.write_text(
@@ -169,8 +170,8 @@ def curves(compiler, tmp_path_factory):
     return program
 
 
-def test_there_are_no_curves(case, curves):
-    """In C++ with a reason, in C with a null."""
+def test_anisotropic_adapters_have_no_curves(case, curves):
+    """C++ throws an error that says why, and C returns a null pointer."""
     done = subprocess.run([curves, case[1]], capture_output=True, text=True, check=True)
     assert "anisotropic" in done.stdout and "prepare by direction" in done.stdout
     runtime = Runtime(case[1])

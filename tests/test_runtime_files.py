@@ -1,4 +1,4 @@
-"""Files of the C++ runtime: weights, refused where they make no sense, and headers generated from the package."""
+"""Files of the C++ runtime: faulty weights files are refused, and the generated headers are up to date."""
 
 import importlib.util
 import json
@@ -32,7 +32,7 @@ def stored(name):
 
 
 def header_of(name):
-    """A stored file's header, what it says about the adapter, and its data."""
+    """Returns the header of a shipped file, its metadata about the adapter, and the bytes of its tensors."""
     data = stored(name)
     size = struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8 : 8 + size])
@@ -46,20 +46,20 @@ def packed(header, about, data):
 
 
 def changed(name, **fields):
-    """A weights file whose metadata differ."""
+    """Returns a weights file (bytes) with changed metadata."""
     header, about, data = header_of(name)
     return packed(header, about | fields, data)
 
 
 def ranged(group, number, **fields):
-    """A weights file in which a parameter of the class, or of the target, differs."""
+    """Returns a weights file with a changed declaration of a parameter, in the group `parameters` or `target`."""
     about = header_of("layered3-3x32")[1]
     about[group][number] |= fields
     return changed("layered3-3x32", **{group: about[group]})
 
 
 def shifted(places, gap=b""):
-    """A weights file whose tensors lie some bytes later, which `gap` makes room for."""
+    """Returns a weights file whose offsets of tensors are larger by `places`, with `gap` before the tensors."""
     header, about, data = header_of("layered3-3x32")
     for entry in (entry for name, entry in header.items() if name != "__metadata__"):
         entry["data_offsets"] = [places + at for at in entry["data_offsets"]]
@@ -73,7 +73,7 @@ def of_integers(name):
 
 
 def with_more(tensor):
-    """A weights file with one more tensor after its own."""
+    """Returns a weights file with one additional tensor at its end."""
     header, about, data = header_of("layered3-3x32")
     extra = {"dtype": tensor.dtype.str.replace("<f", "F").replace("4", "32").replace("8", "64")}
     extra |= {"shape": list(tensor.shape), "data_offsets": [len(data), len(data) + tensor.nbytes]}
@@ -81,7 +81,7 @@ def with_more(tensor):
 
 
 def nested(depth):
-    """A weights file whose training record nests so deep that its metadata do so `depth` times."""
+    """Returns a weights file whose training record makes its metadata nest `depth` deep."""
     _, about, _ = header_of("layered3-3x32")
     about["training"] = "HERE"
     text = json.dumps(about).replace('"HERE"', '{"a": ' * (depth - 1) + "1" + "}" * (depth - 1))
@@ -112,7 +112,7 @@ def nested(depth):
         (changed("layered3-3x32", encoding="azimuth", directional=False), "ignores the direction"),
     ],
 )
-def test_files_that_make_no_sense_are_refused(tmp_path, data, message):
+def test_inconsistent_files_are_refused(tmp_path, data, message):
     path = tmp_path / "bad.safetensors"
     path.write_bytes(data)
     with pytest.raises(WeightsError, match=re.escape(f"{path}: ") + ".*" + re.escape(message)):
@@ -121,7 +121,7 @@ def test_files_that_make_no_sense_are_refused(tmp_path, data, message):
 
 @pytest.mark.usefixtures("compiler")
 def test_a_folder_is_no_weights_file(tmp_path):
-    """It opens as a file does; reading it threw what is no `nma::Error`."""
+    """A folder is refused with an `nma::Error`. It can be opened like a file, and only reading it fails."""
     with pytest.raises(
         WeightsError, match=re.escape(f"{tmp_path}: no such weights file, or it cannot be read")
     ):
@@ -152,8 +152,8 @@ def test_a_folder_is_no_weights_file(tmp_path):
         (ranged("target", 2, in_plane=True), "'metallic' has no plane of incidence"),
     ],
 )
-def test_files_that_are_not_to_be_believed_are_refused(tmp_path, data, message):
-    """Their numbers would become NaN, negative, or garbage that looks like values. The package refuses the same."""
+def test_files_with_implausible_numbers_are_refused(tmp_path, data, message):
+    """The runtime and the package refuse files that would lead to NaN, to negative values or to wrong values."""
     path = tmp_path / "bad.safetensors"
     path.write_bytes(data)
     with pytest.raises(WeightsError, match=re.escape(f"{path}: ") + ".*" + re.escape(message)):
@@ -163,7 +163,7 @@ def test_files_that_are_not_to_be_believed_are_refused(tmp_path, data, message):
 
 
 @pytest.mark.usefixtures("compiler")
-def test_what_is_unusual_but_sound_loads(tmp_path):
+def test_unusual_but_valid_files_load(tmp_path):
     path = tmp_path / "good.safetensors"
     for data in (
         nested(32),
@@ -176,8 +176,11 @@ def test_what_is_unusual_but_sound_loads(tmp_path):
 
 
 @pytest.mark.usefixtures("compiler")
-def test_weights_of_one_material_know_which(tmp_path):
-    """As nma.adapter.Adapter.check has it: to rounding, whatever the training range."""
+def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
+    """The runtime accepts the recorded parameters up to rounding, also beyond the training range, and no others.
+
+    `nma.adapter.Adapter.check` has the same rule.
+    """
     path, vector = tmp_path / "one.safetensors", LAYERED3.sample(np.random.default_rng(0), 1)[0]
     vector[12] = 3.0
     adapter = random_adapter(hidden="1x8", name="direction")
@@ -201,7 +204,7 @@ def test_weights_of_one_material_know_which(tmp_path):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_the_generated_headers_are_those_of_the_present_package(name):
+def test_the_generated_headers_are_up_to_date(name):
     assert (ROOT / "runtime" / name).read_text() == FILES[name](), "run `python -m nma.export`"
 
 
@@ -213,7 +216,7 @@ def module_of(text, path: Path) -> ModuleType:
     return module
 
 
-def test_constructs_beyond_the_subset_are_refused_with_their_place(tmp_path, monkeypatch):
+def test_python_that_cannot_be_exported_is_refused_with_file_and_line(tmp_path, monkeypatch):
     text = """
     def broken(x: float) -> float:
         y = x + 1.0

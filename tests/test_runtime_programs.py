@@ -1,4 +1,4 @@
-"""Programs on the C++ runtime: compilers, instruction sets, sanitizers, damaged files, installation."""
+"""Programs that use the C++ runtime: compilers, instruction sets, sanitizers, damaged files and installation."""
 
 import shutil
 import subprocess
@@ -12,21 +12,21 @@ ROOT = Path(__file__).parent.parent
 RUNTIME = ROOT / "runtime"
 WEIGHTS = [ROOT / f"nma/adapter/trained/{name}.safetensors" for name in ("layered3-5x64", "layered3-3x32")]
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-pthread", f"-I{RUNTIME}"]
-# The second compiler, and most of what follows, waits for `make test-all`.
+# Only `make test-all` runs the tests with the second compiler, and most of the tests below.
 COMPILERS = ["g++", pytest.param("clang++", marks=pytest.mark.slow)]
 ARM, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64-static"
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """Shipped adapters, and an anisotropic one."""
+    """The paths of two shipped adapters and of an anisotropic adapter."""
     path = tmp_path_factory.mktemp("weights") / "anisotropic.safetensors"
     random_anisotropic_adapter().save(path)
     return [*WEIGHTS, path]
 
 
 def tool(name):
-    """Its path; what needs it is skipped where it is missing. `tools/setup.sh test` installs all of them."""
+    """Returns the path of a program, or skips the test if it is missing. `tools/setup.sh test` installs all."""
     found = shutil.which(name)
     if found is None:
         pytest.skip(f"there is no {name} here")
@@ -59,7 +59,11 @@ def test_the_example_compiles_and_runs(compiler, tmp_path):
 
 
 def test_the_example_of_the_simulated_material_agrees_with_itself(tmp_path):
-    """Its four estimates of the same light; a false alarm in some ten thousand. Both ways together beat each."""
+    """The four estimates of the same light in the example agree within 4.5 standard errors.
+
+    A false alarm happens in about one of ten thousand runs. The estimate that combines both samplings has a smaller
+    error than each of them.
+    """
     lines = output(built("g++", "example_layered.cpp", tmp_path, "-O2")).splitlines()[1:]
     means, errors = np.array([[float(x) for x in line.split()[-3::2]] for line in lines]).T
     assert (np.abs(means[:, None] - means) <= 4.5 * np.hypot(errors[:, None], errors)).all()
@@ -78,7 +82,8 @@ def test_every_header_compiles_in_newer_standards(compiler, standard):
 FINITE = """
 #include <cstdio>
 #include "nma/weights.h"
-// Of a weights file that ends in a number that is not finite: why it is refused, and whether parameters of it are.
+// Reads a weights file whose last number is infinite or NaN. Prints whether a parameter may have this value, the
+// clamped value, and why the file is refused.
 int main(int, char** words) {
     const std::string bytes = nma::read_file(words[1]);
     float number;
@@ -97,7 +102,7 @@ int main(int, char** words) {
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_fast_math_refuses_numbers_that_are_not_finite(compiler, tmp_path):
-    """Compilers that take every number for finite drop std::isfinite."""
+    """NaN and infinity are refused even with -ffast-math, with which compilers remove `std::isfinite`."""
     source, program, path = (tmp_path / name for name in ("finite.cpp", "finite", "bad.safetensors"))
     source.write_text(FINITE)
     subprocess.run([tool(compiler), *STRICT, "-O1", "-ffast-math", source, "-o", program], check=True)
@@ -124,21 +129,21 @@ def test_neon_agrees_under_emulation(weights, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sanitizer", ["address,undefined", "thread"])
-def test_sanitizers_find_nothing(sanitizer, tmp_path):
+def test_sanitizers_find_no_fault(sanitizer, tmp_path):
     flags = ["-O0", f"-fsanitize={sanitizer}", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/soak.cpp", tmp_path, *flags)
     assert ", 0 faults" in output(program, 100_000, WEIGHTS[0])
 
 
-def test_sanitizers_find_nothing_in_the_simulated_material(tmp_path):
-    """Walks, estimates, densities and samples of all that the class allows, and of the hard cases."""
+def test_sanitizers_find_no_fault_in_the_simulated_material(tmp_path):
+    """Sanitizers find no fault in walks, estimates, densities and samples of random materials and of hard cases."""
     flags = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/soak_layered.cpp", tmp_path, *flags)
     assert ", 0 faults" in output(program, 20_000)
 
 
 @pytest.mark.slow
-def test_a_million_calls_are_sound(weights, tmp_path):
+def test_a_million_calls_have_no_fault(weights, tmp_path):
     program = built("g++", "tests/soak.cpp", tmp_path, "-O2")
     for path in weights:
         assert ", 0 faults" in output(program, 1_000_000, path)
@@ -156,8 +161,8 @@ def test_damaged_files_load_or_are_refused(weights, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_c_header_is_c(tmp_path):
-    """And C++ without exceptions, linked with a library that has them."""
+def test_the_c_header_compiles_as_c_and_as_cpp_without_exceptions(tmp_path):
+    """A C program and a C++ program without exceptions include the header, and link with the compiled runtime."""
     text = '#include "nma_c.h"\nint main(void) { return !nma_supported(NMA_PORTABLE) || nma_load("none", 0, 0, 0); }\n'
     (tmp_path / "program.c").write_text(text)
     (tmp_path / "plain.cpp").write_text(text)
@@ -176,7 +181,7 @@ def test_the_c_header_is_c(tmp_path):
 
 
 @pytest.mark.slow
-def test_it_installs_for_cmake_and_pkg_config(tmp_path):
+def test_the_runtime_installs_for_cmake_and_pkg_config(tmp_path):
     cmake, prefix = tool("cmake"), tmp_path / "prefix"
     for words in (
         ["-S", RUNTIME, "-B", tmp_path / "b", "-DCMAKE_BUILD_TYPE=Debug"],

@@ -1,4 +1,4 @@
-"""What stands in Python and again in C++ by hand: each is bound case by case. CONTRIBUTING.md lists all twins."""
+"""Code that is written by hand in Python and again in C++ computes the same. CONTRIBUTING.md lists all such twins."""
 
 import ctypes
 import re
@@ -32,7 +32,7 @@ def bridge(compiler, tmp_path_factory):
 
 
 def saved(folder, space, name, instances, directional, params, matrix, bias):
-    """A weights file with a single linear layer."""
+    """Saves an adapter with a single linear layer, and returns the path of its file."""
     layers = [(matrix.astype(np.float32), bias.astype(np.float32))]
     path = folder / "linear.safetensors"
     nma.Adapter(space, name, layers, instances, directional, params).save(path)
@@ -44,7 +44,7 @@ def drawn(space, rng):
 
 
 def views(rng):
-    """Directions, some of them at the pole and near the horizon."""
+    """Returns random view directions (n, 3). Some are the normal itself, and some are near the horizon."""
     wi = rows(random_directions(rng, CASES)).astype(np.float32)
     wi[:100] = (0.0, 0.0, 1.0)
     wi[100:200, 2] = 1e-4
@@ -54,7 +54,10 @@ def views(rng):
 @pytest.mark.parametrize("instances", [1, 2, 3, 4, 5, 8])
 @pytest.mark.parametrize("name", TARGETS)
 def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, instances):
-    """Of random outputs, some of them far beyond what a sigmoid resolves."""
+    """Random outputs are decoded to the same parameters, within 1e-6, for every target and count of instances.
+
+    Some outputs are so large that a sigmoid rounds to its limit.
+    """
     rng, size = np.random.default_rng(instances), output_size(instances, TARGETS[name])
     matrix = rng.normal(size=(size, LIBRARY.size + 1)) * np.where(rng.random((size, 1)) < 0.1, 20.0, 0.5)
     path = saved(tmp_path, LIBRARY, "raw", instances, True, TARGETS[name], matrix, rng.normal(size=size))
@@ -68,7 +71,7 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
         wanted = np.stack([np.broadcast_to(x, CASES) for x in (*columns, *blend.weights)], axis=-1)
         found = np.zeros(wanted.shape, np.float32)
         bridge.brdf_numbers(CASES, instances, pointer(runtime.prepare(params, wi)), pointer(found))
-        # Roundings of the largest number on the way, the width of the range.
+        # The error is relative to the largest number in the computation, which is the width of the range.
         error = np.abs(found - wanted) / (np.abs(wanted) + np.maximum(np.ptp(wanted, axis=0), 1.0))
         assert error.max() < 1e-6, instruction_set
 
@@ -78,8 +81,8 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
     # Anisotropic adapters always follow the direction.
     [(name, d) for name in encoding.ENCODERS for d in (True, False) if d or name not in encoding.ANISOTROPIC],
 )
-def test_networks_read_the_same_inputs(tmp_path, name, directional):
-    """A layer that hands its inputs on shows what they are."""
+def test_networks_have_the_same_inputs(tmp_path, name, directional):
+    """Every encoding gives the network the same inputs. The network here is an identity, which outputs its inputs."""
     rng, space, params = np.random.default_rng(5), CLASS_OF[name], TARGETS["principled"]
     inputs, size = encoding.size(name, space, directional), output_size(4, params)
     path = saved(tmp_path, space, name, 4, directional, params, np.eye(size, inputs), np.zeros(size))
@@ -90,13 +93,13 @@ def test_networks_read_the_same_inputs(tmp_path, name, directional):
     for instruction_set in in_single_precision():
         found = Runtime(path, instruction_set).outputs(numbers, wi)
         error = np.abs(found[:, :inputs] - wanted)
-        # The conductor's Fresnel term cancels for a few metals, at grazing angles most.
+        # The conductor's Fresnel term cancels digits for a few metals, mostly at grazing angles.
         assert np.quantile(error, 0.999) < 2e-6
         assert error.max() < 2e-4
         assert not found[:, inputs:].any()
 
 
-def test_a_single_material_is_known_by_the_same_tolerance(tmp_path):
+def test_a_single_material_is_accepted_within_the_same_tolerance(tmp_path):
     known = LAYERED3.sample(np.random.default_rng(7), 1)[0]
     known[9] = 0.0
     adapter = nma.Adapter.load("layered3-3x32")
@@ -131,7 +134,7 @@ def test_a_brdf_has_the_size_that_the_readme_says(bridge):
     assert bridge.brdf_size() == int(re.search(r"a plain value of (\d+) bytes", readme)[1])
 
 
-def test_instruction_sets_have_the_numbers_of_the_c_header():
+def test_instruction_sets_have_the_values_of_the_c_header():
     header = (ROOT / "runtime/nma_c.h").read_text()
     names = re.search(r"enum \{ (.*) \};", header)[1].split(", ")
     assert tuple(name.removeprefix("NMA_").lower() for name in names[:-1]) == INSTRUCTION_SETS
