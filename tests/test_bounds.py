@@ -25,6 +25,11 @@ NAMES = ("alpha_top", "eta_top", "albedo", "sigma_t")
 INFINITE = [float("nan"), float("inf"), -float("inf")]
 
 
+@pytest.fixture(autouse=True)
+def _variant():
+    nma.render.use("llvm_ad_rgb")
+
+
 @pytest.fixture(scope="module")
 def adapter(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
