@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from nma.errors import either
+
 
 def number(help: str, low: float, high: float, **more: Any) -> Any:
     """A number between two bounds, both included. NaN is refused."""
@@ -53,7 +55,7 @@ def output(help: str, *endings: str, **more: Any) -> Any:
 
     def check(path: Path | None) -> Path | None:
         if path is not None and path.suffix not in endings:
-            raise typer.BadParameter(f"{path} must end in {' or '.join(endings)}")
+            raise typer.BadParameter(f"{path} must end in {either(endings)}")
         return path
 
     return typer.Option("--output", "-o", help=help, callback=check, **more)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.errors import ParamError, one_line
+from nma.errors import ParamError, either, one_line
 from nma.images.io import load_bitmap
 from nma.llvm import ensure_llvm
 
@@ -81,7 +81,7 @@ def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
         ParamError: no lighting has that name, or `hide_sun` is set and the lighting has no sun.
     """
     if lighting not in LIGHTINGS:
-        raise ParamError(f"unknown lighting {lighting!r}; take {' or '.join(LIGHTINGS)}")
+        raise ParamError(f"unknown lighting {lighting!r}; take {either(LIGHTINGS)}")
     if lighting == "outdoors":
         return {"sky": _image(sky_radiance(0.0 if hide_sun else SUN_SCALE)), "lamp": _lamp()}
     if hide_sun:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nma.errors import NmaError, ParamError, one_line
+from nma.errors import NmaError, ParamError, either, one_line
 from nma.images.io import check_size
 from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
@@ -40,7 +40,7 @@ def material_bsdf(
         TextureError: a texture that cannot be read or holds forbidden values.
     """
     if model not in MODELS:
-        raise ParamError(f"unknown model {model!r}; take {' or '.join(MODELS)}")
+        raise ParamError(f"unknown model {model!r}; take {either(MODELS)}")
     settings = {"adapter": str(adapter), "clamp": clamp} if model == "nma" else {}
     return {"type": model, **settings} | {name: _value(value) for name, value in material.values.items()}
 

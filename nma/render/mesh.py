@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma.adapter import Adapter
-from nma.errors import NmaError, one_line
+from nma.errors import NmaError, either, one_line
 
 KINDS = {".ply": "ply", ".obj": "obj"}
 AXES = ("z", "y")
@@ -40,7 +40,7 @@ def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) ->
     import mitsuba as mi
 
     if up not in AXES:
-        raise MeshError(f"the mesh's axis {up!r} cannot point up; take {' or '.join(AXES)}")
+        raise MeshError(f"the mesh's axis {up!r} cannot point up; take {either(AXES)}")
     description = _description(Path(path))
     mesh = _load(description, path)
     if coordinates and not mesh.has_vertex_texcoords():
@@ -66,7 +66,7 @@ def needs_coordinates(bsdf: Mapping[str, Any]) -> bool:
 def _description(path: Path) -> dict[str, Any]:
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
-        raise MeshError(f"mesh {path} must end in {' or '.join(KINDS)}")
+        raise MeshError(f"mesh {path} must end in {either(KINDS)}")
     if not path.is_file():
         raise MeshError(f"there is no mesh {path}")
     return {"type": kind, "filename": str(path)}
