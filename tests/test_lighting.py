@@ -151,8 +151,8 @@ def test_clamping_only_darkens_and_removes_fireflies():
 @pytest.mark.parametrize(
     ("integrator", "message"),
     [
-        ({"type": "ptracer"}, "where each is one path"),
-        ({"type": "prb"}, "where each is one path"),
+        ({"type": "ptracer"}, "if each is one path"),
+        ({"type": "prb"}, "if each is one path"),
         ({"type": "aov", "aovs": "n:sh_normal"}, "beside other channels"),
     ],
 )
