@@ -3,11 +3,11 @@
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered
 //
-// A walk leaves where the material sends it, and so seldom meets a small lamp; `evaluate` looks at the lamp, and so
+// A walk leaves where the material sends it, and so seldom meets a small lamp. `evaluate` looks at the lamp, and so
 // misses what makes a narrow lobe bright. A path tracer does both and weighs each by the odds that the other finds the
-// same light (Veach 1997, eq. 9.8). That needs densities, and a walk has none in closed form; any will do, as long as
-// both ways ask the same: `pdf`, which is near the walk's, so that the weights are good. Samples that are recombined by
-// densities, as in blends and masks of materials, must follow the density to the letter: `sample` does.
+// same light (Veach 1997, eq. 9.8). That needs densities, but a walk has none in closed form. Any density will do, as
+// long as both ways use the same; `pdf` is close to the walk's, so its weights are good. Blends and masks of materials
+// recombine samples by their densities. Such samples must follow their density exactly, as those of `sample` do.
 #include <cstdio>
 
 #include "nma/layered.h"
@@ -17,7 +17,7 @@ using layered::Vec;
 
 // Gold under a red coat: the parameters of the class in CONVENTIONS.md.
 constexpr float GOLD[13] = {.01f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
-// A round lamp of radiance 1 that fills the directions within this cosine of its middle.
+// A round lamp of radiance 1. It fills the directions whose cosine to its middle is larger than this.
 constexpr float LAMP_COS = .95f;
 constexpr float LAMP_PDF = nma::INV_PI<float> / (2.0f * (1.0f - LAMP_COS));
 const Vec VIEW{.6f, 0.0f, .8f}, LAMP{-.8f, 0.0f, .6f};
@@ -47,7 +47,7 @@ Vec towards_lamp(float u1, float u2) {
 }
 
 int main() {
-    const layered::Layers gold = layered::Layers::of(GOLD);
+    const layered::Stack gold = layered::Stack::of(GOLD);
     const layered::Density density(gold, VIEW);
     layered::Random random(1, 1);
     Estimate walks{"walks alone"}, lamp{"evaluate at the lamp alone"}, both{"both, weighed by pdf"},

@@ -37,12 +37,12 @@ Vec view(int row, int rows, layered::Random& random) {
 }
 
 // A direction that follows the density, and the estimate there over it.
-layered::Walk estimate(const layered::Layers& layers, const Vec& wi, layered::Random& random) {
-    const layered::Density density(layers, wi);
+layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Random& random) {
+    const layered::Density density(stack, wi);
     const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
-    const auto drawn = layered::sample(layers, density, wi, u_lobe, u1, u2);
+    const auto drawn = layered::sample(stack, density, wi, u_lobe, u1, u2);
     if (!(drawn.pdf > 0.0f)) return {drawn.wo, NOTHING, 1.0f, false, false};
-    return {drawn.wo, layered::evaluate(layers, wi, drawn.wo, random) * (1.0f / drawn.pdf), 1.0f, false, false};
+    return {drawn.wo, layered::evaluate(stack, wi, drawn.wo, random) * (1.0f / drawn.pdf), 1.0f, false, false};
 }
 
 }  // namespace
@@ -51,9 +51,9 @@ extern "C" {
 
 // All for one material, seen from one direction; rows of `wo`.
 void layered_pdf(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
-    const auto layers = layered::Layers::of(parameters);
-    const layered::Density density(layers, vec(wi));
-    for (int i = 0; i < n; ++i) pdf[i] = layered::pdf(layers, density, vec(wi), vec(wo + 3 * i));
+    const auto stack = layered::Stack::of(parameters);
+    const layered::Density density(stack, vec(wi));
+    for (int i = 0; i < n; ++i) pdf[i] = layered::pdf(stack, density, vec(wi), vec(wo + 3 * i));
 }
 
 // The same for a material and a view in each row.
@@ -64,34 +64,34 @@ void layered_pdf_each(int n, const float* parameters, const float* wi, const flo
 
 // Rows of three uniform numbers to rows of wo, its density, and an estimate of the value.
 void layered_sample(int n, const float* parameters, const float* wi, const float* u, float* out) {
-    const auto layers = layered::Layers::of(parameters);
-    const layered::Density density(layers, vec(wi));
+    const auto stack = layered::Stack::of(parameters);
+    const layered::Density density(stack, vec(wi));
     layered::Random random(1, 2);
     for (int i = 0; i < n; ++i, u += 3, out += 7) {
-        const auto drawn = layered::sample(layers, density, vec(wi), u[0], u[1], u[2]);
+        const auto drawn = layered::sample(stack, density, vec(wi), u[0], u[1], u[2]);
         put(drawn.wo, out);
         out[3] = drawn.pdf;
-        put(drawn.pdf > 0.0f ? layered::evaluate(layers, vec(wi), drawn.wo, random) : NOTHING, out + 4);
+        put(drawn.pdf > 0.0f ? layered::evaluate(stack, vec(wi), drawn.wo, random) : NOTHING, out + 4);
     }
 }
 
 // Rows of throughputs.
 void layered_walks(int n, const float* parameters, const float* wi, float* out) {
-    const auto layers = layered::Layers::of(parameters);
+    const auto stack = layered::Stack::of(parameters);
     layered::Random random(3, 4);
-    for (int i = 0; i < n; ++i) put(layered::walk(layers, vec(wi), random).throughput, out + 3 * i);
+    for (int i = 0; i < n; ++i) put(layered::walk(stack, vec(wi), random).throughput, out + 3 * i);
 }
 
 // Tables from `per_row` walks, or estimates, from each row of views.
 void layered_table(bool walks, int rows, int o, int p, int per_row, int seed, const float* parameters, double* sums,
                    double* squares) {
-    const auto layers = layered::Layers::of(parameters);
+    const auto stack = layered::Stack::of(parameters);
     const Bins bins{o, p, sums, squares};
     for (int row = 0; row < rows; ++row) {
         layered::Random random(static_cast<std::uint64_t>(seed), static_cast<std::uint64_t>(row));
         for (int k = 0; k < per_row; ++k) {
             const Vec wi = view(row, rows, random);
-            const layered::Walk made = walks ? layered::walk(layers, wi, random) : estimate(layers, wi, random);
+            const layered::Walk made = walks ? layered::walk(stack, wi, random) : estimate(stack, wi, random);
             if (made.throughput.x > 0.0f || made.throughput.y > 0.0f || made.throughput.z > 0.0f)
                 bins.add(row, made.direction, made.throughput);
         }
@@ -99,6 +99,6 @@ void layered_table(bool walks, int rows, int o, int p, int per_row, int seed, co
 }
 
 void layered_albedo(const float* parameters, const float* wi, float* out) {
-    put(layered::albedo(layered::Layers::of(parameters), vec(wi)), out);
+    put(layered::albedo(layered::Stack::of(parameters), vec(wi)), out);
 }
 }

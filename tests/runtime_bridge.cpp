@@ -1,4 +1,5 @@
-// What tests of the runtime call beside the C interface: the target on arrays, in float and in double; what is in BRDFs.
+// What tests of the runtime call beside the C interface: the target on arrays, in float and in double, and the numbers
+// in a BRDF.
 #include "nma.h"
 #include "nma_c.h"
 

@@ -24,20 +24,20 @@ struct Input {
 
     SourceParam param;
     ref<Texture> texture;
-    // Numbers as they were checked last and moved into the range, and as `mi.traverse` shows them. Of what is lent,
-    // `value` is what it was when it was checked: of edits by those who share it nobody tells.
+    // The numbers: `value` as they were last checked and moved into the range, `shown` as `mi.traverse` shows them.
+    // Nobody tells of edits to a lent object by others who share it; its `value` is then out of date.
     Colour value, shown;
-    // Of a texture, the channel that a parameter of one number takes; -1 if none was chosen.
+    // The channel of a texture that a parameter of one number takes, or -1.
     int channel = -1;
-    // Whether the texture shows all that it is made of before anything is rendered.
+    // Whether all of the texture's numbers are known before anything is rendered.
     bool known = false;
 
-    // Mesh attributes do, although Mitsuba's say that they do not.
+    // Mesh attributes vary, although Mitsuba says that they do not.
     bool varies() const { return texture && (!known || texture->is_spatially_varying()); }
-    // Whether it is the same everywhere, but kept by an object that others may share.
+    // Whether the input is the same everywhere, but lives in an object that others may share.
     bool lent() const { return texture && !varies(); }
 
-    // The numbers of the texture at `si` as they are.
+    // The numbers of the texture at `si`, unchecked.
     Colour looked_up(const SurfaceInteraction3f& si) const {
         const Colour colour = Colour(texture->eval(si));
         return param.size == 1 ? Colour(colour[std::max(channel, 0)]) : colour;
@@ -51,9 +51,9 @@ public:
     using Input = nma_plugin::Input<Float, Spectrum>;
     using Colour = typename Input::Colour;
 
-    // Ranges are those of the parameters: what the material means, or with `trained` what the adapter was trained on.
-    // There the property `clamp` moves what lies beyond instead of refusing it. What a texture only knows while
-    // rendering (mesh attributes) is moved always.
+    // The ranges of `parameters` are those that the material accepts, or with `trained` those of training. Then the
+    // property `clamp` moves what lies beyond instead of refusing it. Numbers that a texture only knows while rendering
+    // (mesh attributes) are always moved.
     Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained)
         : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
         if (props.has_property("material"))
@@ -73,13 +73,13 @@ public:
         return std::any_of(inputs_.begin(), inputs_.end(), [](const Input& input) { return input.varies(); });
     }
 
-    // Those of a one-sided glossy BSDF with these inputs.
+    // The flags of a one-sided glossy BSDF with these inputs.
     auto flags() const {
         const auto one_sided = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
         return textured() ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;
     }
 
-    // All parameters at `si`, one after the other. After an edit that was refused there are none, until it is mended.
+    // All parameters at `si`, one after the other. After a refused edit there are none until somebody mends it.
     void at(const SurfaceInteraction3f& si, float* to) const {
         if (!fault_.empty()) Throw("%s", fault_);
         for (const Input& input : inputs_) {
@@ -88,7 +88,7 @@ public:
         }
     }
 
-    // Whether inputs that are the same everywhere are what they were when they were checked.
+    // Whether all inputs that are the same everywhere still have the value that was checked.
     bool settled(const SurfaceInteraction3f& si) const {
         return !lent_ || std::all_of(inputs_.begin(), inputs_.end(), [&](const Input& input) {
             return !input.lent() || dr::all(at(input, si) == input.value);
@@ -185,7 +185,7 @@ private:
         return static_cast<int>(place);
     }
 
-    // Refuses what an input may not be; what it may be is its value from now on.
+    // Refuses what the input may not be; everything else becomes its value.
     void settle(Input& input) const {
         const SourceParam& p = input.param;
         if (input.texture) {

@@ -2,9 +2,9 @@
 // Built by `nma mitsuba build`.
 //
 // `eval` is one unbiased estimate. Mitsuba gives it no random numbers; it makes its own from the bits of its arguments.
-// `sample` is one walk where the shape has this very BSDF. Within others, such as `blendbsdf` and `mask`, which
-// recombine samples by their densities, it draws from the density itself, as no walk does, and its weight is an
-// estimate over that.
+// `sample` is one walk if the shape has this very BSDF. Other BSDFs that contain it, such as `blendbsdf` and `mask`,
+// recombine samples by their densities. For them it draws from the density itself, as no walk does, and its weight is
+// an estimate over that density.
 // Properties: the parameters of the class `layered3`.
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/shape.h>
@@ -56,22 +56,22 @@ public:
     MI_DECLARE_CLASS(LayeredBSDF)
 
 private:
-    // The material at one shading point as it is seen there.
+    // The material at one shading point, and the view of it.
     struct View {
-        nma::layered::Layers layers;
+        nma::layered::Stack stack;
         nma::layered::Vec wi;
         nma::layered::Density density;
 
         View(const Inputs& inputs, const SurfaceInteraction3f& si)
-            : layers(at(inputs, si)), wi(direction(si.wi)), density(layers, wi) {}
+            : stack(at(inputs, si)), wi(direction(si.wi)), density(stack, wi) {}
 
-        float pdf(const Vector3f& wo) const { return nma::layered::pdf(layers, density, wi, direction(wo)); }
+        float pdf(const Vector3f& wo) const { return nma::layered::pdf(stack, density, wi, direction(wo)); }
     };
 
-    static nma::layered::Layers at(const Inputs& inputs, const SurfaceInteraction3f& si) {
+    static nma::layered::Stack at(const Inputs& inputs, const SurfaceInteraction3f& si) {
         float numbers[13];
         inputs.at(si, numbers);
-        return nma::layered::Layers::of(numbers);
+        return nma::layered::Stack::of(numbers);
     }
 
     nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const override {
@@ -93,7 +93,7 @@ private:
         if (!(wo.z() > 0.0f)) return {0.0f, 0.0f};
         nma::layered::Random rng = random({wo.x(), wo.y(), wo.z(), si.wi.x(), si.wi.y(), si.wi.z(), si.p.x(), si.p.y(),
                                            si.p.z(), si.uv.x(), si.uv.y()});
-        const nma::Vec3<float> value = nma::layered::evaluate(view.layers, view.wi, direction(wo), rng);
+        const nma::Vec3<float> value = nma::layered::evaluate(view.stack, view.wi, direction(wo), rng);
         return {Spectrum(value.x, value.y, value.z), view.pdf(wo)};
     }
 
@@ -108,11 +108,11 @@ private:
         return {drawn, weight};
     }
 
-    // Where a walk leaves, and its throughput. The density is near its own.
+    // The direction in which a walk leaves, and its throughput. The density is close to the walk's own.
     static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                            BSDFSample3f& drawn) {
         nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
-        const nma::layered::Walk walk = nma::layered::walk(view.layers, view.wi, rng);
+        const nma::layered::Walk walk = nma::layered::walk(view.stack, view.wi, rng);
         const nma::Vec3<float>& t = walk.throughput;
         drawn.wo = Vector3f(walk.direction.x, walk.direction.y, walk.direction.z);
         if (t.x > 0.0f || t.y > 0.0f || t.z > 0.0f) drawn.pdf = view.pdf(drawn.wo);
@@ -122,7 +122,7 @@ private:
     // A direction that follows the density, and the estimate of `eval` over it.
     static Spectrum followed(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                              BSDFSample3f& drawn) {
-        const nma::Vec3<float> wo = nma::layered::sample(view.layers, view.density, view.wi, u, u2.x(), u2.y()).wo;
+        const nma::Vec3<float> wo = nma::layered::sample(view.stack, view.density, view.wi, u, u2.x(), u2.y()).wo;
         drawn.wo = Vector3f(wo.x, wo.y, wo.z);
         const auto [value, pdf] = evaluated(view, si, drawn.wo);
         drawn.pdf = pdf;

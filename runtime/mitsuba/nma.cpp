@@ -1,11 +1,12 @@
 // Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material as its adapter sees it. Built by
 // `nma mitsuba build`.
 //
-// Properties, as of the Python BSDF of the same name: `adapter`, a shipped adapter's name or a weights file; `clamp`;
-// and the parameters of the adapter's class. Beside them, `online`: whether the network also runs at every shading
-// point of a material without textures, which otherwise, unless it is anisotropic, becomes curves over cos(theta_i)
-// when it is loaded; and `precision`: "float32", "compact" (weights of eight bits, faster), or "bfloat16" (activations
-// too, where the CPU has products of such).
+// Properties that the Python BSDF of the same name has, too: `adapter`, the name of a shipped adapter or a weights
+// file; `clamp`; and the parameters of the adapter's class. This plugin has two more:
+// - `online`: run the network at every shading point. Otherwise an isotropic material without textures becomes curves
+//   over cos(theta_i) when it is loaded.
+// - `precision`: "float32"; "compact" (faster, weights of eight bits); or "bfloat16" (activations, too, if the CPU has
+//   such products).
 #include <mitsuba/core/fresolver.h>
 
 #include "nma.h"
@@ -77,8 +78,8 @@ private:
         return std::string(props.get<std::string_view>("adapter", "layered3-5x64"));
     }
 
-    // The parameters that it takes: those of its class, or none where it knows a single material, whose own may be
-    // given all the same.
+    // The parameters that it takes: those of its class. An adapter of a single material takes none, but lets a scene
+    // repeat that material's own.
     static std::vector<SourceParam> wanted(const Properties& props, const nma::Adapter& adapter) {
         if (adapter.material().empty()) return adapter.parameters();
         const float* known = adapter.material().data();
@@ -104,7 +105,7 @@ private:
                     p.name, known[c], numbers[c]);
     }
 
-    // Curves of the present inputs, where a material has such.
+    // Makes curves of the present inputs, unless the material has none.
     void tabulate() {
         if (inputs_.textured() || online_ || adapter_.anisotropic()) return;
         float parameters[MOST_PARAMETERS];
@@ -112,7 +113,7 @@ private:
         curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
     }
 
-    // Weights lie beside the scene, as the files of Mitsuba's own plugins do; shipped ones beside the plugins.
+    // Weights lie beside the scene, like the files of Mitsuba's own plugins; shipped ones lie beside the plugins.
     static nma::Adapter load(const std::string& name, std::string_view precision) {
         const auto resolver = file_resolver();
         auto path = resolver->resolve(name);
@@ -164,8 +165,8 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value for a path from the camera; on one from the light, the camera is towards wo, and the blend is prepared
-    // there, so that both see the same. Swapping the directions of a blend gives another value.
+    // The value for a path from the camera. On a path from the light the camera is towards wo, so the blend is prepared
+    // for wo: both paths see the same. A blend has another value if its directions are swapped.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

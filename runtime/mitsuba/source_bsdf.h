@@ -1,11 +1,11 @@
-// What the BSDFs of a source material share: inputs that Mitsuba shows, edits and evaluates, and a front side alone.
+// What the BSDFs of a source material share: inputs that Mitsuba shows, edits and evaluates, and a single side.
 #pragma once
 
 #include "inputs.h"
 
 namespace mitsuba::nma_plugin {
 
-// A vector of Mitsuba's for the runtime.
+// Mitsuba's vector as one of the runtime.
 template <class Vector>
 nma::Vec3<float> direction(const Vector& v) {
     return {v.x(), v.y(), v.z()};
@@ -30,7 +30,7 @@ public:
         return this->eval_pdf(context, si, wo, active).first;
     }
 
-    // The directional albedo, whatever reflects it: denoisers look for the colour of a surface.
+    // The directional albedo, diffuse or not: denoisers ask for the colour of a surface.
     Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask) const override {
         if (!(si.wi.z() > 0.0f)) return 0.0f;
         const nma::Vec3<float> found = albedo(si);
@@ -49,7 +49,7 @@ public:
         const Input* input = inputs_.find(name);
         return input ? UnpolarizedSpectrum(inputs_.at(*input, si)) : Base::eval_attribute(name, si, active);
     }
-    // Of a colour the mean, as Mitsuba's own constants have it.
+    // The mean of a colour, as of Mitsuba's own constants.
     Float eval_attribute_1(const std::string& name, const SurfaceInteraction3f& si, Mask active) const override {
         const Input* input = inputs_.find(name);
         return input ? dr::mean(inputs_.at(*input, si)) : Base::eval_attribute_1(name, si, active);

@@ -1,4 +1,4 @@
-// The numbers that a texture is made of, as far as they are known before anything is rendered.
+// The numbers of a texture, as far as they are known before anything is rendered.
 #pragma once
 
 #include <drjit/color.h>
@@ -21,7 +21,7 @@ struct Texels {
     std::size_t pixels() const { return numbers.size() / channels; }
 };
 
-// Finds all arrays, numbers and colours that a texture and those inside it show as `data` and `value`.
+// Finds all arrays, numbers and colours that a texture, and textures inside it, show as `data` and `value`.
 template <class Float>
 class TexelFinder final : public TraversalCallback {
 public:

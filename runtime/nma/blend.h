@@ -23,7 +23,7 @@ struct Pack {
     Lanes<T> weights;
     Odds<Lanes<T>> odds;
 
-    // All its numbers in this order, the fields of the instances first.
+    // All its numbers, in the order of the members.
     Lanes<T>* lanes() { return reinterpret_cast<Lanes<T>*>(this); }
     const Lanes<T>* lanes() const { return reinterpret_cast<const Lanes<T>*>(this); }
 };
@@ -38,7 +38,7 @@ struct Blend {
     Blend() = default;
     explicit Blend(int instances) : count(instances), scale{T(1), T(1), T(1)} { std::fill_n(packs, used(), Pack<T>{}); }
 
-    // Packs that hold instances.
+    // How many packs hold instances.
     int used() const { return (count + LANES - 1) / LANES; }
 
     void set(int k, const Principled<T>& instance, T weight) {
@@ -57,7 +57,7 @@ struct Blend {
     }
     T weight(int k) const { return packs[k / LANES].weights[k % LANES]; }
 
-    // Numbers that describe an instance.
+    // How many numbers describe an instance.
     static constexpr int FIELDS = sizeof(Principled<T>) / sizeof(T);
 };
 
@@ -76,12 +76,12 @@ struct Sample {
     T pdf;
 };
 
-// Works out the odds of a blend's lobes at cos(theta_i), and with `bounded` dims it where it might reflect more light
+// Sets the odds of a blend's lobes at cos(theta_i). With `bounded`, also dims a blend that might reflect more light
 // than it receives.
 template <class T>
 inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
     const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
-    // The albedo of the blend, and its three colours together: three times the sum of all odds.
+    // The albedo of the blend per channel, and the sum of its channels, which is three times the sum of all odds.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
@@ -125,8 +125,8 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
     return result;
 }
 
-// The instance that `u` falls to when each takes its share from `start` on, which moves to the end of that share;
-// `count` if there is none.
+// The instance whose share `u` falls into, or `count`. Shares lie one after the other from `start` on; `start` moves to
+// the end of the chosen share.
 template <class T>
 inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::* lobe, T u, T& start) {
     int k = 0;

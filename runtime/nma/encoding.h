@@ -1,4 +1,4 @@
-// What the network reads: a material's parameters and the view direction, turned into about unit-sized numbers. Twin of
+// The network's inputs: a material's parameters and the view direction as numbers of about unit size. Twin of
 // nma/adapter/encoding.py.
 #pragma once
 
@@ -27,7 +27,7 @@ public:
         }
     }
 
-    // Numbers that it takes, and that the network was trained on.
+    // How many parameters it takes, and how many inputs the network was trained on.
     int parameters() const { return parameters_; }
     int size() const {
         switch (kind_) {
@@ -85,10 +85,10 @@ private:
         throw Error("the encoding 'layered3' belongs to another class");
     }
 
-    // Four scalars, three colours, and in the fourth lanes of those what depends on the direction.
+    // The lane of input `i`: four scalars, then three colours, whose fourth lanes hold what depends on the direction.
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
 
-    // The azimuth once and twice, both of which fade towards normal incidence, where there is none. Returns their end.
+    // The azimuth once and twice. Both fade towards normal incidence, where there is no azimuth. Returns their end.
     static float* azimuth(const Vec3<float>& wi, float* x) {
         const float numbers[] = {wi.x, wi.y, wi.x * wi.x - wi.y * wi.y, 2.0f * wi.x * wi.y};
         return std::copy_n(numbers, 4, x);
@@ -97,14 +97,14 @@ private:
     NMA_INLINE void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;
         const float sigma_t = p[layered3::SIGMA_T], eta_top = p[layered3::ETA_TOP];
-        // First what takes longest.
+        // What takes longest comes first.
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
         const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, MIN_COS_T)), Four(-87.0f)));
         const Four one(1.0f), inside(1.0f / eta_top);
         const Four n = four(p + layered3::ETA_CONDUCTOR) * inside, k = four(p + layered3::K_CONDUCTOR) * inside;
         const Four k2 = k * k, less = n - one, more = n + one;
         Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
-        // At normal incidence |n - 1|^2 / |n + 1|^2, which is what fresnel_conductor comes to there.
+        // At normal incidence fresnel_conductor is |n - 1|^2 / |n + 1|^2.
         Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + layered3::ALBEDO);
         const Four plain{p[layered3::ALPHA_TOP], p[layered3::ALPHA_BOTTOM], eta_top, sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;

@@ -1,6 +1,6 @@
 // A reader for JSON (RFC 8259) as far as weights files need it: a tree of values, strict, of bounded depth.
 //
-// Of types that are not complete yet, the standard allows vectors, but no pairs.
+// Names and items lie in two vectors, as the standard allows no pair of a type that is not complete yet.
 #pragma once
 
 #include <cstdint>
@@ -149,7 +149,7 @@ private:
         while (place_ < text_.size() &&
                std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos)
             ++place_;
-        // Unlike strtod, a stream with this locale reads a point as one in every host program.
+        // The host program may have a locale with a decimal comma. Unlike strtod, this stream does not care.
         std::istringstream digits(std::string(text_.substr(first, place_ - first)));
         digits.imbue(std::locale::classic());
         double found = 0.0;
@@ -189,7 +189,7 @@ private:
         return code;
     }
 
-    // A code unit; halves of surrogate pairs, which no field that is read has, stay as they are.
+    // A code unit. Halves of surrogate pairs stay as they are: no field that is read has them.
     static std::string utf8(std::uint32_t code) {
         const auto tail = [](std::uint32_t bits) { return static_cast<char>(0x80 | (bits & 0x3F)); };
         if (code < 0x80) return {static_cast<char>(code)};

@@ -1,6 +1,6 @@
-// Four numbers side by side: the target's functions take them for T, and so evaluate four instances at once.
+// Four numbers side by side. The target's functions take them for T and so evaluate four instances at once.
 //
-// Floats are vectors of the CPU's baseline where the compiler has them (GCC, Clang); anything else is a loop.
+// With GCC and Clang, floats are vectors that every CPU of the kind has. Other types, and other compilers, loop.
 #pragma once
 
 #include <cstdint>
@@ -105,8 +105,8 @@ inline Floats sums(Floats a, Floats b, Floats c, Floats d) {
 }
 #endif
 
-// To two units in the last place for normal numbers; 0 becomes a number below -88. The mantissa is brought to
-// sqrt(1/2) .. sqrt(2), and log(m) is 2 artanh(s), s = (m - 1) / (m + 1), as a series.
+// Exact to two units in the last place for normal numbers; 0 becomes a number below -88. The mantissa m is brought to
+// sqrt(1/2) .. sqrt(2), and log(m) = 2 artanh(s), s = (m - 1) / (m + 1), is a series.
 inline Floats logarithms(Floats a) {
     const Whole bits = (Whole)a, halves = (bits - 0x3f3504f3) >> 23;
     const Floats m = (Floats)(bits - (halves << 23)), exponent = __builtin_convertvector(halves, Floats);
@@ -115,7 +115,7 @@ inline Floats logarithms(Floats a) {
     return exponent * 0.693147181f + (2.0f * s + s * series);
 }
 
-// To two units in the last place for |a| <= 87: 2^n times the series of the rest, which is at most log(2) / 2.
+// Exact to two units in the last place for |a| <= 87: 2^n times a series of the rest, which is at most log(2) / 2.
 inline Floats exponentials(Floats a) {
     const Floats octaves = a * 1.44269504f;
     const Floats half = octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f};

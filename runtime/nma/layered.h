@@ -1,8 +1,8 @@
-// The layered material itself, simulated: a rough dielectric over a homogeneous medium over a rough conductor, by
-// position-free random walks. Scalar twin of nma/sources/layered.py and nma/sources/layered_eval.py; the method and its
-// sources are told there (Guo, Hasan and Zhao 2018).
+// The layered material itself: random walks simulate a rough dielectric over a homogeneous medium over a rough
+// conductor. Scalar twin of nma/sources/layered.py and nma/sources/layered_eval.py, which explain the method (Guo,
+// Hasan and Zhao 2018, "position-free").
 //
-// Directions are unit vectors in the local frame, z up. Values are f cos(theta_o) [1/sr], noisy; densities are per sr.
+// Directions are unit vectors in the local frame, z up. Values are f cos(theta_o) [1/sr] and noisy, densities per sr.
 #pragma once
 
 #include <cstdint>
@@ -38,14 +38,14 @@ private:
     std::uint64_t state_ = 0, increment_;
 };
 
-// The stack. Indices of the conductor are relative to the coat that it lies under.
-struct Layers {
+// The interfaces and the medium. The conductor's indices are relative to those of the coat above it.
+struct Stack {
     float alpha_top, alpha_bottom, eta_top;
     Vec eta_bottom, k_bottom, albedo;
     float sigma_t;
 
     // From a vector of the class `layered3`.
-    static Layers of(const float* p) {
+    static Stack of(const float* p) {
         using namespace layered3;
         const auto colour = [p](int first) { return Vec{p[first], p[first + 1], p[first + 2]}; };
         const float eta = p[ETA_TOP] < 1.0f + INDEX_MATCHED ? 1.0f : p[ETA_TOP], inverse = 1.0f / eta;
@@ -67,15 +67,15 @@ inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
-inline Vec conductor(float cosine, const Layers& layers) {
-    const Vec &eta = layers.eta_bottom, &k = layers.k_bottom;
+inline Vec conductor(float cosine, const Stack& stack) {
+    const Vec &eta = stack.eta_bottom, &k = stack.k_bottom;
     return {fresnel_conductor<float>(cosine, eta.x, k.x), fresnel_conductor<float>(cosine, eta.y, k.y),
             fresnel_conductor<float>(cosine, eta.z, k.z)};
 }
 
 // Fraction that passes `depth` of the slab along `w` without meeting the medium.
-inline float transmittance(const Layers& layers, float depth, const Vec& w) {
-    return layers.sigma_t > 0.0f ? exp(-layers.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
+inline float transmittance(const Stack& stack, float depth, const Vec& w) {
+    return stack.sigma_t > 0.0f ? exp(-stack.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
 }
 
 // Russian roulette on the brightest channel.
@@ -92,8 +92,8 @@ inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     walk.alive = chance > 0.0f;
 }
 
-// One free flight through a medium of `sigma_t` and one event. Returns whether the walk left.
-inline bool step(const Layers& layers, float sigma_t, Walk& walk, Random& random) {
+// Advances a walk by one free flight through a medium of `sigma_t` and one event. Returns whether the walk left.
+inline bool step(const Stack& stack, float sigma_t, Walk& walk, Random& random) {
     const Vec d = walk.direction;
     if (walk.inside && sigma_t > 0.0f) {
         const float height = walk.height - d.z * (log(1.0f - random.uniform()) / sigma_t);
@@ -102,13 +102,13 @@ inline bool step(const Layers& layers, float sigma_t, Walk& walk, Random& random
             const float phi = 2.0f * PI<float> * random.uniform();
             walk.direction = {r * cos(phi), r * sin(phi), z};
             walk.height = height;
-            walk.throughput = walk.throughput * layers.albedo;
+            walk.throughput = walk.throughput * stack.albedo;
             roulette(walk, false, false, random);
             return false;
         }
     }
     const bool upward = walk.inside && d.z > 0.0f, at_bottom = walk.inside && !upward;
-    const float alpha = at_bottom ? layers.alpha_bottom : layers.alpha_top;
+    const float alpha = at_bottom ? stack.alpha_bottom : stack.alpha_top;
     const Vec w{-d.x, -d.y, maximum(absolute(d.z), 1e-7f)};
     const float u1 = random.uniform(), u2 = random.uniform();
     const Vec m = sample_visible_normal<float>(w, alpha, alpha, u1, u2);
@@ -118,9 +118,9 @@ inline bool step(const Layers& layers, float sigma_t, Walk& walk, Random& random
     if (at_bottom) {
         out = reflect<float>(w, m);
         valid = out.z > 0.0f;
-        walk.throughput = walk.throughput * conductor(cos_m, layers);
+        walk.throughput = walk.throughput * conductor(cos_m, stack);
     } else {
-        const float eta = upward ? 1.0f / layers.eta_top : layers.eta_top;
+        const float eta = upward ? 1.0f / stack.eta_top : stack.eta_top;
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cos_m, eta);
         reflects = random.uniform() < fresnel;
         trapped = upward && cos_t <= 0.0f;
@@ -139,16 +139,16 @@ inline bool step(const Layers& layers, float sigma_t, Walk& walk, Random& random
 }
 
 // A walk from `w` just below the coat: all of it goes down.
-inline Walk enter(const Layers& layers, const Vec& w, Random& random) {
-    const float alpha = layers.alpha_top, u1 = random.uniform(), u2 = random.uniform();
+inline Walk enter(const Stack& stack, const Vec& w, Random& random) {
+    const float alpha = stack.alpha_top, u1 = random.uniform(), u2 = random.uniform();
     const Vec view = above(w), m = sample_visible_normal<float>(view, alpha, alpha, u1, u2);
-    const auto [fresnel, cos_t] = fresnel_dielectric<float>(maximum(dot(view, m), 0.0f), layers.eta_top);
-    const Vec down = refract<float>(view, m, cos_t, layers.eta_top);
+    const auto [fresnel, cos_t] = fresnel_dielectric<float>(maximum(dot(view, m), 0.0f), stack.eta_top);
+    const Vec down = refract<float>(view, m, cos_t, stack.eta_top);
     const float weight = down.z < 0.0f ? (1.0f - fresnel) * smith_g1<float>(down, alpha, alpha) : 0.0f;
     return {down, {weight, weight, weight}, 1.0f, true, weight > 0.0f};
 }
 
-// A segment of a walk that met interfaces only: where it heads, and its throughput over the chance that it was kept.
+// A segment of a walk that met interfaces only: its direction, and its throughput over the chance that it was kept.
 struct Way {
     Vec direction, reached;
 };
@@ -168,9 +168,10 @@ struct Detour {
     }
 };
 
-// (q, t): density of `up` when wo is refracted down by visible normals [1/sr], and density of wo given `up` over q.
-inline std::pair<float, float> out_through_coat(const Layers& layers, const Vec& wo, const Vec& up) {
-    const float alpha = layers.alpha_top, eta = layers.eta_top;
+// Returns (q, t). q is the density of `up` when visible normals refract wo down [1/sr]; t is the density of wo given
+// `up`, over q.
+inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& wo, const Vec& up) {
+    const float alpha = stack.alpha_top, eta = stack.eta_top;
     const bool matched = eta == 1.0f;
     const Vec half = up * eta - wo;
     const float length2 = maximum(dot(half, half), 1e-20f);
@@ -182,9 +183,9 @@ inline std::pair<float, float> out_through_coat(const Layers& layers, const Vec&
     return {matched ? 0.0f : visible_normal_pdf<float>(above(wo), m, alpha, alpha) * (eta * eta) * cos_up / length2, t};
 }
 
-// Density about a visit to the conductor [1/sr], the same for both directions in which it can be walked.
-inline float sharpness(const Layers& layers, const Vec& w_in, const Vec& up) {
-    return 0.25f * ggx_d<float>(normalize(w_in + up), layers.alpha_bottom, layers.alpha_bottom);
+// Density about a visit to the conductor [1/sr]. It is the same whichever way the visit is walked.
+inline float sharpness(const Stack& stack, const Vec& w_in, const Vec& up) {
+    return 0.25f * ggx_d<float>(normalize(w_in + up), stack.alpha_bottom, stack.alpha_bottom);
 }
 
 // Density of `out` when `w` is mirrored in a visible normal [1/sr].
@@ -193,46 +194,46 @@ inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
     return visible_normal_pdf<float>(w, m, alpha, alpha) / (4.0f * maximum(dot(w, m), 1e-7f));
 }
 
-// Light from wi to wo that meets interfaces only, and a segment of the walk `there` after its first.
-inline Vec unscattered(const Layers& layers, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
+// Light from wi to wo that meets interfaces only. Sets `detour` to a segment of the walk `there` after its first.
+inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
                        Random& random, bool forward, Way& detour) {
     const Vec drawn_up = -back.direction;
-    const bool matched = layers.eta_top == 1.0f;
-    const auto [drawn_q, drawn_t] = out_through_coat(layers, wo, drawn_up);
-    const float way_in = bluntness(out_through_coat(layers, wi, -there.direction).first);
-    const float drawn_passes = drawn_t * transmittance(layers, 1.0f, drawn_up), blunt_q = bluntness(drawn_q);
+    const bool matched = stack.eta_top == 1.0f;
+    const auto [drawn_q, drawn_t] = out_through_coat(stack, wo, drawn_up);
+    const float way_in = bluntness(out_through_coat(stack, wi, -there.direction).first);
+    const float drawn_passes = drawn_t * transmittance(stack, 1.0f, drawn_up), blunt_q = bluntness(drawn_q);
     Walk walk = there;
     Vec total{0.0f, 0.0f, 0.0f};
     float first = 0.0f;
     Detour kept{there.direction};
     while (walk.alive) {
         Walk before = walk;
-        before.throughput = before.throughput * transmittance(layers, 1.0f, before.direction);
+        before.throughput = before.throughput * transmittance(stack, 1.0f, before.direction);
         walk = before;
-        step(layers, 0.0f, walk, random);
+        step(stack, 0.0f, walk, random);
         kept.offer(walk, random);
         // Only visits to the conductor send light to wo.
         if (walk.height >= 1.0f) continue;
         const Vec w_in = -before.direction;
         const float rest = way_in + first;
-        // The last visit left to chance.
-        float blunt = bluntness(sharpness(layers, w_in, drawn_up));
+        // Leave the last visit to chance.
+        float blunt = bluntness(sharpness(stack, w_in, drawn_up));
         float share = matched ? 1.0f : blunt / (blunt + rest + blunt_q);
         if (!forward && !(first > 0.0f)) share = 0.0f;
         if (share > 0.0f && drawn_passes > 0.0f) {
             const Vec view = above(w_in);
             const float cosine = dot(view, normalize(view + drawn_up));
-            const float weight = share * drawn_passes * mirror_pdf(view, drawn_up, layers.alpha_bottom) *
-                                 smith_g1<float>(drawn_up, layers.alpha_bottom, layers.alpha_bottom);
-            total = total + before.throughput * conductor(cosine, layers) * weight;
+            const float weight = share * drawn_passes * mirror_pdf(view, drawn_up, stack.alpha_bottom) *
+                                 smith_g1<float>(drawn_up, stack.alpha_bottom, stack.alpha_bottom);
+            total = total + before.throughput * conductor(cosine, stack) * weight;
         }
-        // The way out left to chance.
-        blunt = bluntness(sharpness(layers, w_in, walk.direction));
+        // Leave the way out to chance.
+        blunt = bluntness(sharpness(stack, w_in, walk.direction));
         if (!matched) {
-            const auto [q, t] = out_through_coat(layers, wo, walk.direction);
+            const auto [q, t] = out_through_coat(stack, wo, walk.direction);
             if (q > 0.0f && t > 0.0f) {
                 share = bluntness(q) / (bluntness(q) + blunt + rest);
-                total = total + walk.throughput * (share * q * t * transmittance(layers, 1.0f, walk.direction));
+                total = total + walk.throughput * (share * q * t * transmittance(stack, 1.0f, walk.direction));
             }
         }
         if (!(first > 0.0f)) first = blunt;
@@ -241,26 +242,26 @@ inline Vec unscattered(const Layers& layers, const Vec& wi, const Walk& there, c
     return total;
 }
 
-// Light that scatters in the medium: at each scattering, as if it were the last, it takes the ways out.
-inline Vec scattered(const Layers& layers, Walk walk, const Way (&ways)[2], Random& random) {
+// Light that scatters in the medium. Each scattering counts as the last one: from there light takes the ways out.
+inline Vec scattered(const Stack& stack, Walk walk, const Way (&ways)[2], Random& random) {
     Vec total{0.0f, 0.0f, 0.0f};
-    if (!(layers.sigma_t > 0.0f)) return total;
+    if (!(stack.sigma_t > 0.0f)) return total;
     while (walk.alive) {
         const Vec arriving = walk.throughput;
-        step(layers, layers.sigma_t, walk, random);
+        step(stack, stack.sigma_t, walk, random);
         if (!(walk.height > 0.0f && walk.height < 1.0f)) continue;
         Vec out{0.0f, 0.0f, 0.0f};
         for (const Way& way : ways) {
             const Vec& d = way.direction;
             const float depth = d.z < 0.0f ? 1.0f - walk.height : walk.height;
-            out = out + way.reached * (transmittance(layers, depth, d) / maximum(absolute(d.z), 1e-7f));
+            out = out + way.reached * (transmittance(stack, depth, d) / maximum(absolute(d.z), 1e-7f));
         }
-        total = total + arriving * layers.albedo * out * (0.25f * INV_PI<float>);
+        total = total + arriving * stack.albedo * out * (0.25f * INV_PI<float>);
     }
     return total;
 }
 
-// Where light along `w` comes from under a flat coat of index `eta`, pointing up still.
+// The direction of light along `w` under a flat coat of index `eta`; it points up, too.
 inline Vec refract_flat(const Vec& w, float eta) {
     const float x = w.x / eta, y = w.y / eta;
     return {x, y, sqrt(maximum(1.0f - x * x - y * y, 1e-7f))};
@@ -269,52 +270,52 @@ inline Vec refract_flat(const Vec& w, float eta) {
 }  // namespace detail
 
 // f cos(theta_o) of the coat's upper side alone [1/sr].
-inline float coat_reflection(const Layers& layers, const Vec& wi, const Vec& wo) {
+inline float coat_reflection(const Stack& stack, const Vec& wi, const Vec& wo) {
     const Vec m = normalize(wi + wo);
-    const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), layers.eta_top));
-    const float alpha = layers.alpha_top;
+    const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), stack.eta_top));
+    const float alpha = stack.alpha_top;
     const float masking = smith_g1<float>(wi, alpha, alpha) * smith_g1<float>(wo, alpha, alpha);
     return fresnel * ggx_d<float>(m, alpha, alpha) * masking / (4.0f * maximum(wi.z, 1e-7f));
 }
 
 // One unbiased estimate of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
-inline Vec evaluate(const Layers& layers, const Vec& wi, const Vec& wo, Random& random) {
-    Walk there = detail::enter(layers, wi, random), back = detail::enter(layers, wo, random);
+inline Vec evaluate(const Stack& stack, const Vec& wi, const Vec& wo, Random& random) {
+    Walk there = detail::enter(stack, wi, random), back = detail::enter(stack, wo, random);
     there.alive = back.alive = there.alive && back.alive;
     detail::Way unused{}, detour{};
-    const Vec forward = detail::unscattered(layers, wi, there, wo, back, random, true, unused);
-    const Vec backward = detail::unscattered(layers, wo, back, wi, there, random, false, detour);
+    const Vec forward = detail::unscattered(stack, wi, there, wo, back, random, true, unused);
+    const Vec backward = detail::unscattered(stack, wo, back, wi, there, random, false, detour);
     const detail::Way ways[2] = {{back.direction, back.throughput}, detour};
-    const Vec through = detail::scattered(layers, there, ways, random);
-    const float index2 = layers.eta_top * layers.eta_top;
+    const Vec through = detail::scattered(stack, there, ways, random);
+    const float index2 = stack.eta_top * stack.eta_top;
     return forward + backward * (wo.z / maximum(wi.z, 1e-7f)) + through * (wo.z / index2) +
-           coat_reflection(layers, wi, wo);
+           coat_reflection(stack, wi, wo);
 }
 
-// One whole walk from `wi` (wi.z > 0): the direction in which it left, or a throughput of 0.
-inline Walk walk(const Layers& layers, const Vec& wi, Random& random) {
+// One whole walk from `wi` (wi.z > 0). Its throughput is 0 if it was absorbed; else its direction is where it left.
+inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     Walk made{-wi, {1.0f, 1.0f, 1.0f}, 1.0f, false, true};
     bool left = false;
-    while (made.alive) left = detail::step(layers, layers.sigma_t, made, random);
+    while (made.alive) left = detail::step(stack, stack.sigma_t, made, random);
     if (!left) made.throughput = {0.0f, 0.0f, 0.0f};
     return made;
 }
 
-// The density of `pdf` at one wi: weights of its lobes and the width of the second.
+// What `pdf` needs to know of one wi: the weights of its lobes, and the width of the second.
 struct Density {
     float coat, bottom, diffuse, width;
     Vec inside;
 
-    Density(const Layers& layers, const Vec& wi) : inside(detail::refract_flat(wi, layers.eta_top)) {
-        const float eta = layers.eta_top, cos_i = maximum(wi.z, 1e-3f);
+    Density(const Stack& stack, const Vec& wi) : inside(detail::refract_flat(wi, stack.eta_top)) {
+        const float eta = stack.eta_top, cos_i = maximum(wi.z, 1e-3f);
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cos_i, eta);
-        const float crossing = layers.alpha_top * (eta * cos_t - cos_i) / (2.0f * eta * cos_t);
-        const float width2 = layers.alpha_bottom * layers.alpha_bottom + 2.0f * crossing * crossing;
+        const float crossing = stack.alpha_top * (eta * cos_t - cos_i) / (2.0f * eta * cos_t);
+        const float width2 = stack.alpha_bottom * stack.alpha_bottom + 2.0f * crossing * crossing;
         const float critical = 1.0f / (eta + safe_sqrt(eta * eta - 1.0f));
         const float trapped = width2 / (width2 + critical * critical);
-        const float passes = (1.0f - fresnel) * exp(-2.0f * layers.sigma_t / cos_t);
-        bottom = passes * mean(detail::conductor(cos_t, layers));
-        diffuse = LEAST_DIFFUSE + 0.5f * ((1.0f - fresnel - passes) * mean(layers.albedo) + bottom * trapped);
+        const float passes = (1.0f - fresnel) * exp(-2.0f * stack.sigma_t / cos_t);
+        bottom = passes * mean(detail::conductor(cos_t, stack));
+        diffuse = LEAST_DIFFUSE + 0.5f * ((1.0f - fresnel - passes) * mean(stack.albedo) + bottom * trapped);
         const float norm = 1.0f / (fresnel + bottom + diffuse);
         coat = fresnel * norm;
         bottom *= norm;
@@ -323,12 +324,13 @@ struct Density {
     }
 };
 
-// A density of wo [1/sr] near the walk's, integral at most 1, positive for wo.z > 0: for weighing estimators.
-inline float pdf(const Layers& layers, const Density& density, const Vec& wi, const Vec& wo) {
+// A density of wo [1/sr] that is close to the walk's, for weighing estimators. Its integral is at most 1, and it is
+// positive for wo.z > 0.
+inline float pdf(const Stack& stack, const Density& density, const Vec& wi, const Vec& wo) {
     if (!(wo.z > 0.0f)) return 0.0f;
-    const Vec inside_o = detail::refract_flat(wo, layers.eta_top);
-    const float jacobian = wo.z / (layers.eta_top * layers.eta_top * inside_o.z);
-    const float mirrored = density.coat * detail::mirror_pdf(detail::above(wi), wo, layers.alpha_top);
+    const Vec inside_o = detail::refract_flat(wo, stack.eta_top);
+    const float jacobian = wo.z / (stack.eta_top * stack.eta_top * inside_o.z);
+    const float mirrored = density.coat * detail::mirror_pdf(detail::above(wi), wo, stack.alpha_top);
     const float seen = density.bottom * detail::mirror_pdf(density.inside, inside_o, density.width) * jacobian;
     return mirrored + seen + density.diffuse * INV_PI<float> * wo.z;
 }
@@ -339,29 +341,29 @@ struct Drawn {
     float pdf;
 };
 
-// A direction from `pdf` itself, by three uniform numbers in [0, 1). Its weight is `evaluate` over the density, which
-// varies more than a walk's throughput; but where samples of several materials are recombined by their densities, walks
-// will not do: no density is known that their directions follow.
-inline Drawn sample(const Layers& layers, const Density& density, const Vec& wi, float u_lobe, float u1, float u2) {
+// Draws a direction from `pdf` itself with three uniform numbers in [0, 1). Its weight is `evaluate` over the density,
+// which varies more than a walk's throughput. But a renderer that recombines samples of several materials needs their
+// exact densities, and that of a walk is not known.
+inline Drawn sample(const Stack& stack, const Density& density, const Vec& wi, float u_lobe, float u1, float u2) {
     Vec wo;
     if (u_lobe < density.coat) {
-        wo = sample_spec<float>(detail::above(wi), layers.alpha_top, layers.alpha_top, u1, u2);
+        wo = sample_spec<float>(detail::above(wi), stack.alpha_top, stack.alpha_top, u1, u2);
     } else if (u_lobe < density.coat + density.bottom) {
         const Vec up = sample_spec<float>(density.inside, density.width, density.width, u1, u2);
-        const float x = up.x * layers.eta_top, y = up.y * layers.eta_top, z2 = 1.0f - x * x - y * y;
+        const float x = up.x * stack.eta_top, y = up.y * stack.eta_top, z2 = 1.0f - x * x - y * y;
         wo = {x, y, up.z > 0.0f ? safe_sqrt(z2) : 0.0f};
     } else {
         wo = sample_diffuse<float>(u1, u2);
     }
-    return {wo, pdf(layers, density, wi, wo)};
+    return {wo, pdf(stack, density, wi, wo)};
 }
 
-// Directional albedo at `wi` (wi.z > 0), the mean of a fixed set of walks: the same for equal arguments, at most 1.
-inline Vec albedo(const Layers& layers, const Vec& wi, int walks = 256) {
+// The directional albedo at `wi` (wi.z > 0), at most 1: the mean of a fixed set of walks, so it has no noise.
+inline Vec albedo(const Stack& stack, const Vec& wi, int walks = 256) {
     Vec sum{0.0f, 0.0f, 0.0f};
     for (int k = 0; k < walks; ++k) {
         Random random(static_cast<std::uint64_t>(k), 0);
-        sum = sum + walk(layers, wi, random).throughput;
+        sum = sum + walk(stack, wi, random).throughput;
     }
     const float share = 1.0f / static_cast<float>(walks);
     return {minimum(sum.x * share, 1.0f), minimum(sum.y * share, 1.0f), minimum(sum.z * share, 1.0f)};

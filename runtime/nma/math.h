@@ -1,4 +1,4 @@
-// Arithmetic that the target is written in: scalars of type T (float or double), and triples of them.
+// The arithmetic of the target: scalars of type T (float, double or four of them), and triples of scalars.
 #pragma once
 
 #include <algorithm>
@@ -31,8 +31,8 @@ inline std::uint32_t bits(float x) {
     std::memcpy(&found, &x, sizeof(found));
     return found;
 }
-// With -ffast-math compilers take every number for finite; only its bits tell. Those of infinity are 0x7f800000, but
-// for the sign, and those of NaN lie beyond.
+// With -ffast-math compilers assume that every number is finite, so look at its bits. Apart from the sign, infinity is
+// 0x7f800000 and NaN lies above.
 inline bool is_finite(float x) { return (bits(x) & 0x7fffffff) < 0x7f800000; }
 inline bool is_nan(float x) { return (bits(x) & 0x7fffffff) > 0x7f800000; }
 

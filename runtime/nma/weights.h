@@ -34,7 +34,7 @@ struct SourceParam {
     int size = 1;
     bool logarithmic = false;
     double low = 0.0, high = 0.0;
-    // (value - start) per_range lies in 0 .. 1 over the range, of the logarithm for a logarithmic one.
+    // (x - start) per_range lies in 0 .. 1 over the range. x is the value, or its logarithm if `logarithmic`.
     float start = 0.0f, per_range = 1.0f;
 
     // Whether x is finite and within the range, but for a rounding error.
@@ -49,7 +49,7 @@ struct SourceParam {
     }
 };
 
-// Whether x is the number that is known of a material, but for its rounding to single precision.
+// Whether x is the known number of a material, apart from rounding to single precision.
 inline bool same(float x, float known) { return is_finite(x) && absolute(x - known) <= SAME * absolute(known) + 1e-8f; }
 
 struct Weights {
@@ -59,17 +59,17 @@ struct Weights {
     std::vector<Layer> layers;
     int instances = 0;
     bool directional = false, bounded = false;
-    // The parameters of the only material that the network was fitted to. Empty where it knows a class, or where the
-    // class has none.
+    // The parameters of the only material that the network was fitted to. Empty if it knows a class, or one without
+    // parameters.
     std::vector<float> material;
 };
 
 namespace detail {
 
 constexpr int WIDEST = 4096, DEEPEST = 64;
-// Ends of ranges lie no farther from 0.
+// The largest absolute value of a range's ends.
 constexpr double FARTHEST = 1e6;
-// Whole numbers up to here are doubles.
+// A double holds all whole numbers up to here.
 constexpr double MOST_BYTES = 9e15;
 
 // The whole numbers of an array, each in 0 .. limit.
@@ -110,7 +110,7 @@ inline Place place(const std::string& name, const Json& entry, std::size_t size)
     return made;
 }
 
-// The tensors of a file. They fill its data from the first byte to the last: others were shifted, or hide something.
+// The tensors of a file. They must fill its data from the first byte to the last, as gaps may hide something.
 inline std::vector<Place> places(const Json& header, std::size_t size) {
     std::vector<Place> made;
     for (std::size_t k = 0; k < header.names.size(); ++k)
@@ -172,7 +172,7 @@ inline bool flag(const Json& entry, std::string_view name) {
     return found && found->kind == Json::Kind::Boolean && found->boolean;
 }
 
-// The fields `low` and `high`. They are finite: JSON has no word for other numbers, and the reader refuses large ones.
+// The fields `low` and `high`. They are finite, as JSON has no word for infinity and the reader refuses large numbers.
 inline std::pair<double, double> range(const Json& entry) {
     return {entry.at("low", Json::Kind::Number).number, entry.at("high", Json::Kind::Number).number};
 }
@@ -192,7 +192,7 @@ inline SourceParam source_param(const Json& entry) {
     return p;
 }
 
-// What the Principled BRDF knows by this name and size.
+// The field of the Principled BRDF with this name and size.
 inline const Field& field(const std::string& name, int size) {
     for (const Field& f : FIELDS)
         if (f.name == name && f.size == size) return f;
@@ -217,7 +217,7 @@ inline TargetParam target_param(const Json& entry) {
     return p;
 }
 
-// What the record of a fit says of its only material, if the network reads no parameters but knows those of one.
+// The parameters of the only material, from the record of its fit. Empty unless the network reads the direction alone.
 inline std::vector<float> material(const Json& about, const Weights& made) {
     std::size_t size = 0;
     for (const SourceParam& p : made.parameters) size += static_cast<std::size_t>(p.size);
@@ -276,7 +276,7 @@ inline Weights parse_weights(const void* bytes, std::size_t size) {
 inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     std::string bytes;
-    // Iterators would throw what is no `Error` where a folder, or a disk that fails, opens but cannot be read.
+    // A folder opens, but cannot be read, like a file on a broken disk. Iterators would not throw an `Error` then.
     for (char block[1 << 14]; file.read(block, sizeof block), file.gcount() > 0;)
         bytes.append(block, static_cast<std::size_t>(file.gcount()));
     if (!file.eof()) throw Error("no such weights file, or it cannot be read");

@@ -1,4 +1,4 @@
-// The network on every instruction set of this CPU against the portable code.
+// Compares the network on every instruction set of this CPU with the portable code.
 //
 //     c++ -std=c++17 -O2 -Iruntime runtime/tests/compare.cpp -o compare
 //     ./compare WEIGHTS
@@ -56,7 +56,7 @@ int main(int count, char** words) {
                 worst = std::max(worst, error);
                 squares += error * error;
             }
-            // bfloat16 keeps 8 bits of each activation; float32 sums in another order differ by roundings of their
+            // bfloat16 keeps 8 bits of each activation. In float32 the order of a sum changes the rounding of its
             // terms, which are larger than the outputs.
             const bool rounded = set == nma::InstructionSet::avx512_bf16;
             const double rms = std::sqrt(squares / static_cast<double>(wanted.size()));

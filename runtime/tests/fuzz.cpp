@@ -1,4 +1,4 @@
-// Bytes that call themselves a weights file: whatever they are, loading ends in an adapter that works or in an error.
+// Loads bytes that claim to be a weights file: the outcome must be an adapter that works, or an error.
 //
 // Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER
 //                           -Iruntime runtime/tests/fuzz.cpp -o fuzz
@@ -22,7 +22,7 @@ void require(bool sound) {
     if (!sound) std::abort();
 }
 
-// An adapter from these bytes is asked for a material, and refusal must be an `Error`. Returns whether it loaded.
+// Loads an adapter from these bytes and asks it for a BRDF. A refusal must be an `Error`. Returns whether it loaded.
 bool attempt(const std::uint8_t* data, std::size_t size) {
     try {
         const nma::Adapter adapter = nma::Adapter::from_memory(data, size);

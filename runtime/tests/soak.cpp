@@ -1,4 +1,4 @@
-// Random materials and directions by the million: nothing is NaN, infinite or negative, and samples agree with eval.
+// Millions of random materials and directions: nothing is NaN, infinite or negative, and samples agree with eval_pdf.
 //
 //     c++ -std=c++17 -O2 -pthread -Iruntime runtime/tests/soak.cpp -o soak
 //     ./soak CALLS WEIGHTS        calls of eval_pdf, pdf and sample together; threads share the adapter

@@ -27,22 +27,21 @@ constexpr float HARD[][nma::layered3::COLUMNS] = {
 };
 
 // A material, and `CALLS_PER_ROUND` calls. Returns what is wrong, or null.
-const char* round_of_calls(const layered::Layers& layers, nma::tests::Random& random, layered::Random& walking) {
+const char* round_of_calls(const layered::Stack& stack, nma::tests::Random& random, layered::Random& walking) {
     const layered::Vec wi = draw_direction(random);
-    const layered::Density density(layers, wi);
+    const layered::Density density(stack, wi);
     for (int k = 0; k < 2; ++k) {
-        const layered::Walk walk = layered::walk(layers, wi, walking);
+        const layered::Walk walk = layered::walk(stack, wi, walking);
         if (!sound(walk.throughput, 0.0f)) return "walk";
         if (walk.throughput.x > 0.0f && !(walk.direction.z > 0.0f)) return "where a walk leaves";
         const layered::Vec wo = draw_direction(random);
-        if (!sound(layered::evaluate(layers, wi, wo, walking), layered::pdf(layers, density, wi, wo)))
-            return "evaluate";
-        const layered::Drawn drawn = layered::sample(layers, density, wi, random(), random(), random());
+        if (!sound(layered::evaluate(stack, wi, wo, walking), layered::pdf(stack, density, wi, wo))) return "evaluate";
+        const layered::Drawn drawn = layered::sample(stack, density, wi, random(), random(), random());
         if (!nma::is_finite(drawn.pdf) || drawn.pdf < 0.0f) return "sample";
-        if (drawn.pdf > 0.0f && !sound(layered::evaluate(layers, wi, drawn.wo, walking), 0.0f))
+        if (drawn.pdf > 0.0f && !sound(layered::evaluate(stack, wi, drawn.wo, walking), 0.0f))
             return "evaluate a sample";
     }
-    return sound(layered::albedo(layers, wi, 2), 0.0f) ? nullptr : "albedo";
+    return sound(layered::albedo(stack, wi, 2), 0.0f) ? nullptr : "albedo";
 }
 
 }  // namespace
@@ -61,7 +60,7 @@ int main(int count, char** words) {
         float drawn[nma::layered3::COLUMNS];
         nma::tests::draw_parameters(parameters, random, drawn);
         const float* material = n % 2 ? HARD[n / 2 % std::size(HARD)] : drawn;
-        if (const char* what = round_of_calls(layered::Layers::of(material), random, walking))
+        if (const char* what = round_of_calls(layered::Stack::of(material), random, walking))
             if (faults++ < 10) std::fprintf(stderr, "round %ld: %s\n", n, what);
     }
     std::printf("%ld calls, %ld faults\n", rounds * CALLS_PER_ROUND, faults);
