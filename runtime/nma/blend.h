@@ -1,4 +1,5 @@
-// The blend of Principled BRDFs: one evaluation, one density, one sample over all lobes. Twin of nma/target/blend.py.
+// A blend of Principled BRDFs: its value, and one density and one sample over all its lobes. Twin of
+// nma/target/blend.py.
 //
 // Directions are unit vectors in the local frame, z up, `wi` towards the viewer and `wo` towards the light.
 #pragma once
@@ -10,25 +11,26 @@ namespace nma {
 
 constexpr int MAX_PACKS = 2, MAX_INSTANCES = MAX_PACKS * LANES;
 
-// Chance of each lobe of an instance.
+// The odds of a sample: the probability that it is drawn from each lobe of an instance.
 template <class T>
 struct Odds {
     T diffuse, spec, clearcoat;
 };
 
-// Four instances side by side, with their weights and odds. A lane without an instance holds zeros.
+// Four instances side by side, with their weights and their odds. A lane without an instance holds zeros.
 template <class T>
 struct Pack {
     Principled<Lanes<T>> instances;
     Lanes<T> weights;
     Odds<Lanes<T>> odds;
 
-    // All its numbers, in the order of the members.
+    // All numbers of the pack as an array, in the order above: first the fields of the instances.
     Lanes<T>* lanes() { return reinterpret_cast<Lanes<T>*>(this); }
     const Lanes<T>* lanes() const { return reinterpret_cast<const Lanes<T>*>(this); }
 };
 
-// Instances and their weights, which sum to one. `weigh` fills in the odds, and `scale`, which dims the whole.
+// Instances and their weights, which sum to 1. `weigh` fills in the odds. It also fills in `scale`, the factor of the
+// blend's value in each colour channel.
 template <class T>
 struct Blend {
     int count = 0;
@@ -38,7 +40,7 @@ struct Blend {
     Blend() = default;
     explicit Blend(int instances) : count(instances), scale{T(1), T(1), T(1)} { std::fill_n(packs, used(), Pack<T>{}); }
 
-    // How many packs hold instances.
+    // The count of packs that hold instances.
     int used() const { return (count + LANES - 1) / LANES; }
 
     void set(int k, const Principled<T>& instance, T weight) {
@@ -57,18 +59,18 @@ struct Blend {
     }
     T weight(int k) const { return packs[k / LANES].weights[k % LANES]; }
 
-    // How many numbers describe an instance.
+    // The count of numbers that describe an instance.
     static constexpr int FIELDS = sizeof(Principled<T>) / sizeof(T);
 };
 
-// A value f cos(theta_o) [1/sr] and the density of `sample` [1/sr].
+// The value f cos(theta_o) [1/sr] of a pair of directions, and the density with which `sample` draws `wo` [1/sr].
 template <class T>
 struct Evaluation {
     Vec3<T> value{T(0), T(0), T(0)};
     T pdf = T(0);
 };
 
-// A direction with its value and density; pdf == 0 marks an invalid one.
+// A direction with its value and its density. A density of 0 marks an invalid direction.
 template <class T>
 struct Sample {
     Vec3<T> wo;
@@ -76,12 +78,13 @@ struct Sample {
     T pdf;
 };
 
-// Sets the odds of a blend's lobes at cos(theta_i). With `bounded`, also dims a blend that might reflect more light
-// than it receives.
+// Fills in the odds of the blend's lobes at cos(theta_i), which follow the estimated albedos of the lobes. If
+// `bounded`, also fills in `scale`, so that the blend reflects no more light than it receives.
 template <class T>
 inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
     const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
-    // The albedo of the blend per channel, and the sum of its channels, which is three times the sum of all odds.
+    // Lanes 0 to 2 hold the albedo of the blend in red, green and blue. Lane 3 holds their sum, which is three times
+    // the sum of all odds before they are normalised.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
@@ -100,14 +103,14 @@ inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
     if (bounded) blend.scale = {inverse[0], inverse[1], inverse[2]};
 }
 
-// The same geometry for every lane.
+// Copies a geometry to all lanes.
 template <class T>
 inline Geometry<Lanes<T>> spread(const Geometry<T>& g) {
     const auto all = [](const Vec3<T>& v) { return Vec3<Lanes<T>>{v.x, v.y, v.z}; };
     return {g.valid, all(g.wi), all(g.wo), all(g.h), g.cos_d, g.weight_i, g.weight_o, g.weight_d, g.clearcoat};
 }
 
-// f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both zero below the horizon.
+// The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. Both are 0 below the horizon.
 template <class T>
 inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
     Evaluation<T> result;
@@ -125,8 +128,9 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
     return result;
 }
 
-// The instance whose share `u` falls into, or `count`. Shares lie one after the other from `start` on; `start` moves to
-// the end of the chosen share.
+// The index of the instance that `u` chooses. From `start` on, each instance has an interval as long as the odds of its
+// `lobe`, and `u` lies in the interval of the chosen one. Moves `start` to the end of that interval. Returns `count` if
+// `u` lies beyond all intervals.
 template <class T>
 inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::* lobe, T u, T& start) {
     int k = 0;
@@ -134,11 +138,11 @@ inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::* lobe, T u, T
     return k;
 }
 
-// A direction from three uniform numbers in [0, 1), with `eval_pdf` of it.
+// Draws a direction from three uniform numbers in [0, 1). Returns it with its value and its density.
 template <class T>
 inline Sample<T> sample(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1, T u2) {
     if (!(wi.z > MIN_COS<T>)) return {{T(0), T(0), T(1)}, {T(0), T(0), T(0)}, T(0)};
-    // All diffuse lobes come first, then all specular ones, then the clearcoats.
+    // In the order of `u_lobe`, all diffuse lobes come first, then all specular lobes, then all clearcoats.
     T end = T(0);
     for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].odds.diffuse);
     Vec3<T> wo;

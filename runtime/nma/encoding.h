@@ -1,5 +1,5 @@
-// The network's inputs: a material's parameters and the view direction as numbers of about unit size. Twin of
-// nma/adapter/encoding.py.
+// The inputs of the network: the parameters of a material and the view direction, turned into numbers of about unit
+// size. Twin of nma/adapter/encoding.py.
 #pragma once
 
 #include "constants.h"
@@ -27,8 +27,9 @@ public:
         }
     }
 
-    // How many parameters it takes, and how many inputs the network was trained on.
+    // The count of numbers that `encode` reads as parameters.
     int parameters() const { return parameters_; }
+    // The count of inputs that the network was trained on.
     int size() const {
         switch (kind_) {
             case Kind::Raw:
@@ -41,10 +42,11 @@ public:
                 return 13 + 3 * directional_;
         }
     }
-    // Whether the view's azimuth matters: `encode` reads all of wi, otherwise wi.z alone.
+    // Whether the azimuth of `wi` matters. If not, `encode` reads wi.z alone.
     bool anisotropic() const { return kind_ == Kind::Azimuth; }
 
-    // The network's first layer for numbers in the order of `encode`.
+    // The first layer of a file, changed so that it takes the inputs in the order in which `encode` writes them. For
+    // the encoding `layered3`, that order differs from the order that the network was trained on: `place` shows both.
     Layer arranged(const Layer& first) const {
         if (kind_ != Kind::Layered3) return first;
         Layer made{4 * LANES, first.out, std::vector<float>(4 * LANES * static_cast<std::size_t>(first.out)),
@@ -54,7 +56,7 @@ public:
         return made;
     }
 
-    // `x` is padded with zeros to `stride`.
+    // Writes the inputs to `x`, and zeros after them up to `stride` numbers. `p` holds the parameters.
     void encode(const float* p, const Vec3<float>& wi, float* x, int stride) const {
         if (kind_ == Kind::Layered3) return layered3(p, wi.z, x);
         float* const end = x + stride;
@@ -79,16 +81,23 @@ private:
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
+    // The parameter of this name, which must have one number.
     static const SourceParam& scalar(const Weights& weights, const char* name) {
         for (const SourceParam& p : weights.parameters)
             if (p.name == name && p.size == 1) return p;
         throw Error("the encoding 'layered3' belongs to another class");
     }
 
-    // The lane of input `i`: four scalars, then three colours, whose fourth lanes hold what depends on the direction.
+    // Where `encode` puts input i of the encoding `layered3`. In the order of training, the inputs are four scalars,
+    // three colours and three numbers that depend on the direction. `encode` computes vectors of four lanes, so each
+    // colour gets one number of the direction as its fourth lane:
+    //
+    //     order of training    s0 s1 s2 s3  r0 g0 b0  r1 g1 b1  r2 g2 b2  d0 d1 d2
+    //     order of `encode`    s0 s1 s2 s3  r0 g0 b0 d0  r1 g1 b1 d1  r2 g2 b2 d2
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
 
-    // The azimuth once and twice. Both fade towards normal incidence, where there is no azimuth. Returns their end.
+    // Writes sin(theta_i) times cosine and sine of the azimuth phi, and sin^2(theta_i) times cosine and sine of 2 phi.
+    // The factors fade towards normal incidence, which has no azimuth. Returns the end of what it wrote.
     static float* azimuth(const Vec3<float>& wi, float* x) {
         const float numbers[] = {wi.x, wi.y, wi.x * wi.x - wi.y * wi.y, 2.0f * wi.x * wi.y};
         return std::copy_n(numbers, 4, x);
@@ -97,14 +106,14 @@ private:
     NMA_INLINE void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;
         const float sigma_t = p[layered3::SIGMA_T], eta_top = p[layered3::ETA_TOP];
-        // What takes longest comes first.
+        // This takes longest, so it comes first.
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
         const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, MIN_COS_T)), Four(-87.0f)));
         const Four one(1.0f), inside(1.0f / eta_top);
         const Four n = four(p + layered3::ETA_CONDUCTOR) * inside, k = four(p + layered3::K_CONDUCTOR) * inside;
         const Four k2 = k * k, less = n - one, more = n + one;
         Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
-        // At normal incidence fresnel_conductor is |n - 1|^2 / |n + 1|^2.
+        // `fresnel_conductor` at normal incidence: |eta - 1|^2 / |eta + 1|^2 for the complex index eta = n + i k.
         Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + layered3::ALBEDO);
         const Four plain{p[layered3::ALPHA_TOP], p[layered3::ALPHA_BOTTOM], eta_top, sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
@@ -117,7 +126,7 @@ private:
         put(x + 3 * LANES, albedo);
     }
 
-    // Four numbers, from 0 .. 1 to -1 .. 1.
+    // Stores four numbers, moved from the range 0 .. 1 to the range -1 .. 1.
     static void put(float* x, const Lanes<float>& units) {
         const Lanes<float> spread = units * Lanes<float>(2.0f) - Lanes<float>(1.0f);
         std::memcpy(x, &spread, sizeof(spread));
@@ -132,7 +141,8 @@ private:
     Kind kind_ = Kind::Raw;
     bool directional_ = false;
     int parameters_ = 0;
-    // How the four scalar parameters of `layered3` become units.
+    // For the four scalar parameters of `layered3`: 1 if the logarithm is taken, and then what to subtract, and the
+    // factor that leads to 0 .. 1.
     Lanes<float> log_{0.0f}, start_{0.0f}, per_range_{0.0f};
 };
 

@@ -1,6 +1,7 @@
-// A reader for JSON (RFC 8259) as far as weights files need it: a tree of values, strict, of bounded depth.
+// A strict reader for JSON (RFC 8259), as far as weights files need it. It returns a tree of values of limited depth.
 //
-// Names and items lie in two vectors, as the standard allows no pair of a type that is not complete yet.
+// An object keeps its names and its items in two vectors, because std::pair may not hold the type `Json` before that
+// type is complete; std::vector may.
 #pragma once
 
 #include <cstdint>
@@ -23,16 +24,17 @@ struct Json {
     bool boolean = false;
     double number = 0.0;
     std::string string;
-    std::vector<Json> items;         // of an array or an object, in order
-    std::vector<std::string> names;  // of an object's items
+    std::vector<Json> items;         // the items of an array or of an object, in order
+    std::vector<std::string> names;  // the names of an object's items
 
-    // The field called `name`, or null.
+    // The item called `name`, or null.
     const Json* find(std::string_view name) const {
         for (std::size_t k = 0; k < names.size(); ++k)
             if (names[k] == name) return &items[k];
         return nullptr;
     }
 
+    // The item called `name`. Throws unless it exists and is of the expected kind.
     const Json& at(std::string_view name, Kind expected) const {
         const Json* found = find(name);
         if (!found || found->kind != expected) throw Error("its metadata lacks a valid '" + std::string(name) + "'");
@@ -74,7 +76,7 @@ private:
     }
 
     void expect(std::string_view word) {
-        if (!take(word)) fail("something else was expected");
+        if (!take(word)) fail(("'" + std::string(word) + "' was expected").c_str());
     }
 
     Json value(int depth) {
@@ -149,7 +151,7 @@ private:
         while (place_ < text_.size() &&
                std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos)
             ++place_;
-        // The host program may have a locale with a decimal comma. Unlike strtod, this stream does not care.
+        // A stream with this locale reads "." as the decimal point. strtod would follow the locale of the host program.
         std::istringstream digits(std::string(text_.substr(first, place_ - first)));
         digits.imbue(std::locale::classic());
         double found = 0.0;
@@ -189,7 +191,7 @@ private:
         return code;
     }
 
-    // A code unit. Halves of surrogate pairs stay as they are: no field that is read has them.
+    // A code unit as UTF-8. The two halves of a surrogate pair are not joined: no field that the runtime reads has any.
     static std::string utf8(std::uint32_t code) {
         const auto tail = [](std::uint32_t bits) { return static_cast<char>(0x80 | (bits & 0x3F)); };
         if (code < 0x80) return {static_cast<char>(code)};

@@ -1,6 +1,8 @@
-// Four numbers side by side. The target's functions take them for T and so evaluate four instances at once.
+// Four numbers side by side. The functions of target.h take `Lanes<T>` in place of T, and so evaluate four instances at
+// once.
 //
-// With GCC and Clang, floats are vectors that every CPU of the kind has. Other types, and other compilers, loop.
+// With GCC and Clang, four floats are a vector of the instructions that every CPU of the target has. Four doubles, and
+// four floats with other compilers, are loops over an array.
 #pragma once
 
 #include <cstdint>
@@ -19,7 +21,7 @@ constexpr int LANES = 4;
 
 namespace detail {
 
-// Four numbers without help of the compiler.
+// Four numbers in an array, for types and compilers without vectors.
 template <class T>
 struct Four {
     T lane[LANES];
@@ -105,8 +107,8 @@ inline Floats sums(Floats a, Floats b, Floats c, Floats d) {
 }
 #endif
 
-// Exact to two units in the last place for normal numbers; 0 becomes a number below -88. The mantissa m is brought to
-// sqrt(1/2) .. sqrt(2), and log(m) = 2 artanh(s), s = (m - 1) / (m + 1), is a series.
+// Natural logarithms, to two units in the last place for normal numbers. 0 gives a number below -88. The mantissa m is
+// brought to sqrt(1/2) .. sqrt(2). Then log(m) = 2 artanh(s) for s = (m - 1) / (m + 1), computed as a series in s.
 inline Floats logarithms(Floats a) {
     const Whole bits = (Whole)a, halves = (bits - 0x3f3504f3) >> 23;
     const Floats m = (Floats)(bits - (halves << 23)), exponent = __builtin_convertvector(halves, Floats);
@@ -115,7 +117,8 @@ inline Floats logarithms(Floats a) {
     return exponent * 0.693147181f + (2.0f * s + s * series);
 }
 
-// Exact to two units in the last place for |a| <= 87: 2^n times a series of the rest, which is at most log(2) / 2.
+// e^a, to two units in the last place for |a| <= 87: 2^n for a whole number n, times a series in the rest, which is at
+// most log(2) / 2.
 inline Floats exponentials(Floats a) {
     const Floats octaves = a * 1.44269504f;
     const Floats half = octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f};
@@ -161,7 +164,7 @@ template <class T> inline Lanes<T> exp(const Lanes<T>& a) { return detail::expon
 template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(maximum(a, Lanes<T>(T(0)))); }
 
 template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
-// The sums of four, side by side.
+// The sums of a, b, c and d, side by side.
 template <class T> inline Lanes<T> sums(const Lanes<T>& a, const Lanes<T>& b, const Lanes<T>& c, const Lanes<T>& d) {
     return detail::sums(a.v, b.v, c.v, d.v);
 }

@@ -1,4 +1,4 @@
-// The arithmetic of the target: scalars of type T (float, double or four of them), and triples of scalars.
+// The arithmetic of target.h: scalars of type T, which is float, double or `Lanes` (lanes.h), and vectors of three.
 #pragma once
 
 #include <algorithm>
@@ -31,8 +31,8 @@ inline std::uint32_t bits(float x) {
     std::memcpy(&found, &x, sizeof(found));
     return found;
 }
-// With -ffast-math compilers assume that every number is finite, so look at its bits. Apart from the sign, infinity is
-// 0x7f800000 and NaN lies above.
+// With -ffast-math, compilers assume that every number is finite, so these functions look at the bits. Without the
+// sign, the bits of infinity are 0x7f800000, and the bits of NaN are larger.
 inline bool is_finite(float x) { return (bits(x) & 0x7fffffff) < 0x7f800000; }
 inline bool is_nan(float x) { return (bits(x) & 0x7fffffff) > 0x7f800000; }
 
