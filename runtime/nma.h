@@ -260,11 +260,14 @@ private:
     void check_description() const {
         if (anisotropic() && (in_plane_ || !weights_.directional))
             throw Error(
-                "anisotropic, but its target holds in the plane of incidence, or ignores the direction; train again");
+                "it is anisotropic, but its target holds in the plane of incidence, or it ignores the direction; train "
+                "again");
         if (weights_.dialect != DIALECT)
-            throw Error("written for the Principled dialect '" + weights_.dialect + "', not '" + DIALECT + "'");
+            throw Error("it was written for the Principled dialect '" + weights_.dialect +
+                        "', this version evaluates '" + DIALECT + "'");
         if (weights_.instances > MAX_INSTANCES)
-            throw Error("a blend of more than " + std::to_string(MAX_INSTANCES) + " instances");
+            throw Error("it blends more than " + std::to_string(MAX_INSTANCES) +
+                        " instances, which this version cannot");
         if (weights_.layers.front().in != preparation_.encoding.size() || weights_.layers.back().out != output_count())
             throw Error("the network does not fit its description; train again");
     }
@@ -354,7 +357,7 @@ public:
     Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
         if (adapter.anisotropic())
             throw Error(
-                "an anisotropic adapter has no curves, as the azimuth of the view matters; prepare by direction");
+                "an anisotropic adapter has no curves, because the azimuth of the view matters; prepare by direction");
         for (int n = 0; n < std::max(nodes, 2); ++n) {
             const float cosine = static_cast<float>(n) / static_cast<float>(std::max(nodes, 2) - 1);
             nodes_.push_back(adapter.prepare(parameters, maximum(cosine, MIN_COS)));

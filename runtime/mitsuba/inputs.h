@@ -1,4 +1,4 @@
-// Parameters of a source material as the inputs of a Mitsuba BSDF: a number, a colour or a texture each.
+// The inputs of a Mitsuba BSDF for a source material. Each parameter is an input: a number, a colour or a texture.
 #pragma once
 
 #include <mitsuba/core/logger.h>
@@ -16,7 +16,7 @@ namespace mitsuba::nma_plugin {
 
 using nma::SourceParam;
 
-// One input: a texture, or numbers where there is none.
+// One input: a texture, or numbers.
 template <class Float, class Spectrum>
 struct Input {
     MI_IMPORT_TYPES(Texture)
@@ -24,20 +24,22 @@ struct Input {
 
     SourceParam param;
     ref<Texture> texture;
-    // The numbers: `value` as they were last checked and moved into the range, `shown` as `mi.traverse` shows them.
-    // Nobody tells of edits to a lent object by others who share it; its `value` is then out of date.
+    // `shown` holds the numbers that `mi.traverse` shows. `value` holds the numbers that were last checked, moved into
+    // the range. If the object of a texture is shared, another owner may edit it without a call to this input. `value`
+    // is then out of date.
     Colour value, shown;
-    // The channel of a texture that a parameter of one number takes, or -1.
+    // For a parameter of one number: the index of the texture's channel that it takes. -1 if none was chosen.
     int channel = -1;
-    // Whether all of the texture's numbers are known before anything is rendered.
+    // Whether all numbers of the texture are known before anything is rendered.
     bool known = false;
 
-    // Mesh attributes vary, although Mitsuba says that they do not.
+    // Whether the input may differ between points. A texture whose numbers are not known, such as a mesh attribute,
+    // may differ even where Mitsuba says that it does not.
     bool varies() const { return texture && (!known || texture->is_spatially_varying()); }
-    // Whether the input is the same everywhere, but lives in an object that others may share.
-    bool lent() const { return texture && !varies(); }
+    // Whether the input is the same at all points, but is an object that may have other owners.
+    bool shared() const { return texture && !varies(); }
 
-    // The numbers of the texture at `si`, unchecked.
+    // The numbers of the texture at `si`, without a check.
     Colour looked_up(const SurfaceInteraction3f& si) const {
         const Colour colour = Colour(texture->eval(si));
         return param.size == 1 ? Colour(colour[std::max(channel, 0)]) : colour;
@@ -51,9 +53,9 @@ public:
     using Input = nma_plugin::Input<Float, Spectrum>;
     using Colour = typename Input::Colour;
 
-    // The ranges of `parameters` are those that the material accepts, or with `trained` those of training. Then the
-    // property `clamp` moves what lies beyond instead of refusing it. Numbers that a texture only knows while rendering
-    // (mesh attributes) are always moved.
+    // Reads one input for each of `parameters` from the properties, and checks it against the range of the parameter.
+    // `trained` says that these are training ranges. With them, the property `clamp` moves numbers into the range
+    // instead of refusing them. Numbers that a texture gets only while rendering (mesh attributes) are always moved.
     Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained)
         : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
         if (props.has_property("material"))
@@ -64,11 +66,12 @@ public:
             if (!props.has_property(p.name)) Throw("no value for %s; give it a number, a colour or a texture", p.name);
             inputs_.push_back(read(props, p));
             inputs_.back().channel = channel(props, inputs_.back());
-            settle(inputs_.back());
-            lent_ |= inputs_.back().lent();
+            accept(inputs_.back());
+            any_shared_ |= inputs_.back().shared();
         }
     }
 
+    // Whether any input may differ between points.
     bool textured() const {
         return std::any_of(inputs_.begin(), inputs_.end(), [](const Input& input) { return input.varies(); });
     }
@@ -79,7 +82,8 @@ public:
         return textured() ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;
     }
 
-    // All parameters at `si`, one after the other. After a refused edit there are none until somebody mends it.
+    // Writes the numbers of all parameters at `si`, one after the other. After an edit that was refused, this throws
+    // until another edit is accepted.
     void at(const SurfaceInteraction3f& si, float* to) const {
         if (!fault_.empty()) Throw("%s", fault_);
         for (const Input& input : inputs_) {
@@ -88,10 +92,10 @@ public:
         }
     }
 
-    // Whether all inputs that are the same everywhere still have the value that was checked.
-    bool settled(const SurfaceInteraction3f& si) const {
-        return !lent_ || std::all_of(inputs_.begin(), inputs_.end(), [&](const Input& input) {
-            return !input.lent() || dr::all(at(input, si) == input.value);
+    // Whether all inputs that are the same at all points still have the values that were checked.
+    bool unchanged(const SurfaceInteraction3f& si) const {
+        return !any_shared_ || std::all_of(inputs_.begin(), inputs_.end(), [&](const Input& input) {
+            return !input.shared() || dr::all(at(input, si) == input.value);
         });
     }
 
@@ -107,7 +111,7 @@ public:
     // Checks all inputs after an edit.
     void changed() {
         try {
-            for (Input& input : inputs_) settle(input);
+            for (Input& input : inputs_) accept(input);
             fault_.clear();
         } catch (const std::exception& e) {
             fault_ = e.what();
@@ -121,7 +125,7 @@ public:
         return found == inputs_.end() ? nullptr : &*found;
     }
 
-    // One or three numbers at `si`, within the range.
+    // The one or three numbers of an input at `si`, within the range.
     Colour at(const Input& input, const SurfaceInteraction3f& si) const {
         if (!input.texture) return input.value;
         const Colour colour = input.looked_up(si);
@@ -173,7 +177,7 @@ private:
         return input;
     }
 
-    // The channel that the property NAME_channel chooses, or -1.
+    // The index of the channel that the property NAME_channel chooses, or -1.
     static int channel(const Properties& props, const Input& input) {
         const std::string name = input.param.name + "_channel";
         if (!props.has_property(name)) return -1;
@@ -185,14 +189,14 @@ private:
         return static_cast<int>(place);
     }
 
-    // Refuses what the input may not be; everything else becomes its value.
-    void settle(Input& input) const {
+    // Throws if the input is not allowed. Otherwise stores its numbers as `value`.
+    void accept(Input& input) const {
         const SourceParam& p = input.param;
         if (input.texture) {
             const TexelFinder<Float> finder(*input.texture);
             input.known = finder.complete;
             for (const Texels& texels : finder.found) check(input, texels);
-            if (input.lent()) input.value = at(input, dr::zeros<SurfaceInteraction3f>());
+            if (input.shared()) input.value = at(input, dr::zeros<SurfaceInteraction3f>());
             return;
         }
         for (int c = 0; c < p.size; ++c)
@@ -200,7 +204,8 @@ private:
         input.value = within(p, input.shown);
     }
 
-    // Refuses pixels that are not allowed, or colours where a single number is wanted and no channel was chosen.
+    // Throws if a pixel is not allowed, or if pixels are coloured, the parameter has one number, and no channel was
+    // chosen.
     void check(const Input& input, const Texels& texels) const {
         const SourceParam& p = input.param;
         const auto& numbers = texels.numbers;
@@ -237,7 +242,7 @@ private:
         return nma::is_finite(number) && (clamp_ || p.allows(number));
     }
 
-    // What to say of a value that is not allowed: the sentence of `Bounds.refusal` in nma/params.py.
+    // The message for a value that is not allowed. `Bounds.refusal` in nma/params.py has the same sentence.
     std::string refusal(const SourceParam& p, const Colour& found) const {
         const auto text = [](Float x) { return tfm::format("%.7g", x); };
         const std::string x = text(found.x()), y = text(found.y()), z = text(found.z());
@@ -249,7 +254,7 @@ private:
     }
 
     std::vector<Input> inputs_;
-    bool trained_, clamp_, lent_ = false;
+    bool trained_, clamp_, any_shared_ = false;
     std::string fault_;
 };
 

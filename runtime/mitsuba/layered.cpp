@@ -1,11 +1,12 @@
 // Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, the reference for its adapter.
-// Built by `nma mitsuba build`.
+// `nma mitsuba build` compiles it. Its properties are the parameters of the class `layered3`.
 //
-// `eval` is one unbiased estimate. Mitsuba gives it no random numbers; it makes its own from the bits of its arguments.
-// `sample` is one walk if the shape has this very BSDF. Other BSDFs that contain it, such as `blendbsdf` and `mask`,
-// recombine samples by their densities. For them it draws from the density itself, as no walk does, and its weight is
-// an estimate over that density.
-// Properties: the parameters of the class `layered3`.
+// `eval` returns one unbiased estimate of the value. Mitsuba passes it no random numbers, so it makes its own from the
+// bits of its arguments.
+//
+// `sample` follows one walk if the shape has this very BSDF. Other BSDFs may contain this one, such as `blendbsdf` and
+// `mask`. They recombine samples by their densities, so the directions must follow `pdf` exactly, which a walk's do
+// not. For them, `sample` draws from `pdf`, and the weight is an estimate of the value divided by `pdf`.
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/shape.h>
 
@@ -56,7 +57,7 @@ public:
     MI_DECLARE_CLASS(LayeredBSDF)
 
 private:
-    // The material at one shading point, and the view of it.
+    // The material at one shading point, and the direction in which it is seen.
     struct View {
         nma::layered::Stack stack;
         nma::layered::Vec wi;
@@ -78,7 +79,7 @@ private:
         return nma::layered::albedo(at(inputs_, si), direction(si.wi));
     }
 
-    // A stream of random numbers that depends on the bits of `numbers`.
+    // A generator of random numbers that depends on the bits of `numbers`.
     template <std::size_t N>
     static nma::layered::Random random(const float (&numbers)[N]) {
         std::uint32_t a = N, b = 0x9e3779b9u;
@@ -108,7 +109,7 @@ private:
         return {drawn, weight};
     }
 
-    // The direction in which a walk leaves, and its throughput. The density is close to the walk's own.
+    // The direction in which a walk leaves. Returns the walk's throughput. The density is close to the walk's own.
     static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                            BSDFSample3f& drawn) {
         nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
@@ -119,7 +120,7 @@ private:
         return Spectrum(t.x, t.y, t.z);
     }
 
-    // A direction that follows the density, and the estimate of `eval` over it.
+    // A direction that follows the density. Returns an estimate of the value, divided by the density.
     static Spectrum followed(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                              BSDFSample3f& drawn) {
         const nma::Vec3<float> wo = nma::layered::sample(view.stack, view.density, view.wi, u, u2.x(), u2.y()).wo;

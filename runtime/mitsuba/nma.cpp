@@ -1,12 +1,12 @@
-// Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material as its adapter sees it. Built by
-// `nma mitsuba build`.
+// Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material, rendered by its adapter. `nma mitsuba build`
+// compiles it.
 //
-// Properties that the Python BSDF of the same name has, too: `adapter`, the name of a shipped adapter or a weights
-// file; `clamp`; and the parameters of the adapter's class. This plugin has two more:
+// It shares some properties with the Python BSDF of the same name: `adapter`, the name of a shipped adapter or a
+// weights file; `clamp`; and the parameters of the adapter's class. This plugin has two more:
 // - `online`: run the network at every shading point. Otherwise an isotropic material without textures becomes curves
 //   over cos(theta_i) when it is loaded.
-// - `precision`: "float32"; "compact" (faster, weights of eight bits); or "bfloat16" (activations, too, if the CPU has
-//   such products).
+// - `precision`: "float32"; "compact", which stores weights as bfloat16 and is faster; or "bfloat16", which also rounds
+//   activations to bfloat16 if the CPU has products of bfloat16.
 #include <mitsuba/core/fresolver.h>
 
 #include "nma.h"
@@ -78,8 +78,8 @@ private:
         return std::string(props.get<std::string_view>("adapter", "layered3-5x64"));
     }
 
-    // The parameters that it takes: those of its class. An adapter of a single material takes none, but lets a scene
-    // repeat that material's own.
+    // The parameters that the BSDF reads: those of the adapter's class. It reads none if the adapter was fitted to a
+    // single material. A scene may still give the parameters of that material, but no others.
     static std::vector<SourceParam> wanted(const Properties& props, const nma::Adapter& adapter) {
         if (adapter.material().empty()) return adapter.parameters();
         const float* known = adapter.material().data();
@@ -90,6 +90,7 @@ private:
         return {};
     }
 
+    // Throws if the property of parameter `p` differs from `known`, the numbers of the single material.
     static void refuse_others(const Properties& props, SourceParam p, const float* known) {
         p.low = -1e30, p.high = 1e30;
         const Inputs given(props, {p}, false);
@@ -105,7 +106,7 @@ private:
                     p.name, known[c], numbers[c]);
     }
 
-    // Makes curves of the present inputs, unless the material has none.
+    // Makes the curves of the present inputs, if the material can have curves.
     void tabulate() {
         if (inputs_.textured() || online_ || adapter_.anisotropic()) return;
         float parameters[MOST_PARAMETERS];
@@ -113,7 +114,8 @@ private:
         curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
     }
 
-    // Weights lie beside the scene, like the files of Mitsuba's own plugins; shipped ones lie beside the plugins.
+    // Weights files are searched where Mitsuba searches files: beside the scene, and beside the plugins, where the
+    // shipped weights are.
     static nma::Adapter load(const std::string& name, std::string_view precision) {
         const auto resolver = file_resolver();
         auto path = resolver->resolve(name);
@@ -136,7 +138,7 @@ private:
 
     nma::Brdf prepare(const SurfaceInteraction3f& si) const {
         const float cosine = nma::clip(static_cast<float>(si.wi.z()), nma::Curves::MIN_COS, 1.0f);
-        if (curves_ && inputs_.settled(si)) return curves_->at(cosine);
+        if (curves_ && inputs_.unchanged(si)) return curves_->at(cosine);
         float parameters[MOST_PARAMETERS];
         inputs_.at(si, parameters);
         return adapter_.prepare(parameters,
@@ -165,8 +167,9 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value for a path from the camera. On a path from the light the camera is towards wo, so the blend is prepared
-    // for wo: both paths see the same. A blend has another value if its directions are swapped.
+    // The value that this plugin returns to Mitsuba. On a path from the camera, it is `value`. On a path from the
+    // light, the camera is towards `wo`, so a blend is prepared for `wo`. Both kinds of paths then see the same
+    // reflection: one blend would give another value with its two directions swapped.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

@@ -1,11 +1,12 @@
-// What the BSDFs of a source material share: inputs that Mitsuba shows, edits and evaluates, and a single side.
+// The common part of the BSDFs `nma` and `layered`. Mitsuba can show, edit and evaluate their inputs. They reflect on
+// the front side only.
 #pragma once
 
 #include "inputs.h"
 
 namespace mitsuba::nma_plugin {
 
-// Mitsuba's vector as one of the runtime.
+// Converts a vector of Mitsuba to a vector of the runtime.
 template <class Vector>
 nma::Vec3<float> direction(const Vector& v) {
     return {v.x(), v.y(), v.z()};
@@ -30,7 +31,8 @@ public:
         return this->eval_pdf(context, si, wo, active).first;
     }
 
-    // The directional albedo, diffuse or not: denoisers ask for the colour of a surface.
+    // The directional albedo of all reflection, not only of the diffuse part: denoisers ask for the colour of a
+    // surface.
     Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask) const override {
         if (!(si.wi.z() > 0.0f)) return 0.0f;
         const nma::Vec3<float> found = albedo(si);
@@ -49,7 +51,7 @@ public:
         const Input* input = inputs_.find(name);
         return input ? UnpolarizedSpectrum(inputs_.at(*input, si)) : Base::eval_attribute(name, si, active);
     }
-    // The mean of a colour, as of Mitsuba's own constants.
+    // For a colour, the mean of its channels, as Mitsuba's own textures return it.
     Float eval_attribute_1(const std::string& name, const SurfaceInteraction3f& si, Mask active) const override {
         const Input* input = inputs_.find(name);
         return input ? dr::mean(inputs_.at(*input, si)) : Base::eval_attribute_1(name, si, active);
@@ -60,10 +62,10 @@ public:
     }
 
 protected:
-    // For wi.z > 0.
+    // The directional albedo at si.wi, whose z is positive.
     virtual nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const = 0;
 
-    // Whether there is nothing to see: from behind, or with glossy reflection left out.
+    // Whether the value is 0 for all `wo`: seen from behind, or if the context leaves out glossy reflection.
     static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
         return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
     }
@@ -71,7 +73,7 @@ protected:
     Inputs inputs_;
 };
 
-// Registers a plugin for `scalar_rgb` alone: other variants have the Python BSDF of the same name.
+// Registers a plugin for the variant `scalar_rgb` only. Other variants use the Python BSDF of the same name.
 #define NMA_EXPORT_SCALAR_PLUGIN(Name)                                                   \
     template class Name<float, Color<float, 3>>;                                         \
     extern "C" MI_EXPORT void init_plugin(std::string_view name, PluginRegisterFn add) { \

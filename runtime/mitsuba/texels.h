@@ -11,11 +11,11 @@
 
 namespace mitsuba::nma_plugin {
 
-// Rows of `width` pixels of `channels` numbers; single numbers and colours are one pixel.
+// An array of pixels, in rows of `width` pixels, with `channels` numbers each. A single number or colour is one pixel.
 struct Texels {
     std::vector<float> numbers;
     std::size_t width = 1, channels = 1;
-    // Whether Mitsuba keeps bytes.
+    // Whether Mitsuba stores the numbers as bytes.
     bool bytes = false;
 
     std::size_t pixels() const { return numbers.size() / channels; }
@@ -28,8 +28,7 @@ public:
     explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
 
     std::vector<Texels> found;
-    // Whether each of those textures showed something. Others, such as mesh attributes, know their numbers only while
-    // they render.
+    // Whether each of these textures showed something. Mesh attributes, for one, have no numbers before rendering.
     bool complete = true;
 
 protected:
@@ -55,7 +54,7 @@ protected:
     }
 
 private:
-    // Of an array (height, width, channels) of numbers of type T.
+    // Stores the pixels if `value` is an array (height, width, channels) of numbers of type T. Returns whether it is.
     template <class T>
     bool pixels(void* value, const std::type_info& type) {
         using Tensor = dr::Tensor<dr::DynamicArray<T>>;
@@ -65,7 +64,8 @@ private:
                       tensor.ndim() > 1 ? tensor.shape(1) : 1,
                       tensor.ndim() > 2 ? tensor.shape(2) : 1,
                       std::is_same_v<T, uint8_t>};
-        // Mitsuba decodes bytes when it looks them up, from sRGB unless the texture is `raw`.
+        // Mitsuba stores bytes as they are in the file. On a lookup it decodes them from sRGB, unless the texture is
+        // `raw`.
         const bool srgb = texels.bytes && shown_->to_string().find("raw = 1") == std::string::npos;
         for (std::size_t k = 0; k < tensor.size(); ++k) {
             float x = static_cast<float>(tensor.array().entry(k));

@@ -17,7 +17,7 @@ public:
     explicit Encoding(const Weights& weights) : kind_(kind_named(weights.encoding)), directional_(weights.directional) {
         for (const SourceParam& p : weights.parameters) parameters_ += p.size;
         if (kind_ != Kind::Layered3) return;
-        if (parameters_ != layered3::COLUMNS) throw Error("the encoding 'layered3' belongs to another class");
+        if (parameters_ != layered3::COLUMNS) throw Error(WRONG_CLASS);
         int k = 0;
         for (const char* name : {"alpha_top", "alpha_bottom", "eta_top", "sigma_t"}) {
             const SourceParam& p = scalar(weights, name);
@@ -72,6 +72,8 @@ public:
 
 private:
     enum class Kind { Raw, Direction, Azimuth, Layered3 };
+    static constexpr const char* WRONG_CLASS =
+        "the encoding 'layered3' does not fit the parameters of its class; train again";
 
     static Kind kind_named(const std::string& name) {
         if (name == "raw") return Kind::Raw;
@@ -85,7 +87,7 @@ private:
     static const SourceParam& scalar(const Weights& weights, const char* name) {
         for (const SourceParam& p : weights.parameters)
             if (p.name == name && p.size == 1) return p;
-        throw Error("the encoding 'layered3' belongs to another class");
+        throw Error(WRONG_CLASS);
     }
 
     // Where `encode` puts input i of the encoding `layered3`. In the order of training, the inputs are four scalars,

@@ -40,7 +40,8 @@ public:
     // Rounds the weights to bfloat16 if `compact` is true or `set` is avx512_bf16. They then take half the memory.
     Network(const std::vector<Layer>& layers, InstructionSet set, bool compact) : kernels_(&kernels(set)) {
         if (layers.size() > DEEPEST_NETWORK)
-            throw Error("a network of more than " + std::to_string(DEEPEST_NETWORK) + " layers");
+            throw Error("its network has more than " + std::to_string(DEEPEST_NETWORK) +
+                        " layers, which this version cannot run");
         view_.depth = static_cast<int>(layers.size());
         const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
         int in = detail::padded(layers.front().in, INPUT_STEP);
@@ -51,7 +52,8 @@ public:
             const bool last = k + 1 == layers.size();
             const int out = layers[k].out + (last ? 1 : 0);
             if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER)
-                throw Error("a layer is wider than " + std::to_string(WIDEST_LAYER) + " neurons");
+                throw Error("its network has a layer of more than " + std::to_string(WIDEST_LAYER) +
+                            " neurons, which this version cannot run");
             LayerView& view = view_.layers[k];
             view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
             view.bias = keep(layers[k].bias, view.width);

@@ -1,4 +1,5 @@
-// The weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of nma/adapter/weights.py.
+// Reads the weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of
+// nma/adapter/weights.py.
 #pragma once
 
 #include <algorithm>
@@ -14,13 +15,13 @@
 
 namespace nma {
 
-// A linear layer: `matrix` is (out, in) by rows.
+// A linear layer. `matrix` has `out` rows of `in` weights.
 struct Layer {
     int in = 0, out = 0;
     std::vector<float> matrix, bias;
 };
 
-// A field of `Principled` that the network sets, with the range of its decoded values.
+// A target parameter: a field of `Principled` that the network sets, and the range of its decoded values.
 struct TargetParam {
     std::string name;
     int size = 1;
@@ -28,7 +29,7 @@ struct TargetParam {
     bool logarithmic = false, in_plane = false;
 };
 
-// A parameter of the source material with its training range.
+// A parameter of the source material, and its training range.
 struct SourceParam {
     std::string name;
     int size = 1;
@@ -37,19 +38,19 @@ struct SourceParam {
     // (x - start) per_range lies in 0 .. 1 over the range. x is the value, or its logarithm if `logarithmic`.
     float start = 0.0f, per_range = 1.0f;
 
-    // Whether x is finite and within the range, but for a rounding error.
+    // Whether x is finite and in the range. A rounding error beyond an end is allowed.
     bool allows(float x) const {
         const double slack = ROUNDING * minimum(high - low, 1.0);
         return is_finite(x) && x >= low - slack && x <= high + slack;
     }
-    // The nearest number of the range; the lower end for NaN.
+    // The number of the range that is nearest to x, or the lower end if x is NaN.
     float clamped(float x) const {
         const float least = static_cast<float>(low);
         return is_nan(x) ? least : clip(x, least, static_cast<float>(high));
     }
 };
 
-// Whether x is the known number of a material, apart from rounding to single precision.
+// Whether x equals `known`, a number of a material, within the rounding to single precision.
 inline bool same(float x, float known) { return is_finite(x) && absolute(x - known) <= SAME * absolute(known) + 1e-8f; }
 
 struct Weights {
@@ -59,40 +60,41 @@ struct Weights {
     std::vector<Layer> layers;
     int instances = 0;
     bool directional = false, bounded = false;
-    // The parameters of the only material that the network was fitted to. Empty if it knows a class, or one without
-    // parameters.
+    // The parameters of the material, if the network was fitted to a single one. Empty if the network was trained on a
+    // class, or if the class has no parameters.
     std::vector<float> material;
 };
 
 namespace detail {
 
 constexpr int WIDEST = 4096, DEEPEST = 64;
-// The largest absolute value of a range's ends.
+// The largest absolute value that an end of a range may have.
 constexpr double FARTHEST = 1e6;
 // A double holds all whole numbers up to here.
 constexpr double MOST_BYTES = 9e15;
 
-// The whole numbers of an array, each in 0 .. limit.
+// The whole numbers of an array. Throws if a number is not whole or not in 0 .. limit.
 inline std::vector<std::uint64_t> whole(const Json& array, double limit) {
     std::vector<std::uint64_t> found;
     for (const Json& item : array.items) {
         if (item.kind != Json::Kind::Number || !(item.number >= 0 && item.number <= limit) ||
             item.number != std::floor(item.number))
-            throw Error("its header has a size that makes no sense");
+            throw Error("its header has a size that is negative, too large or not a whole number");
         found.push_back(static_cast<std::uint64_t>(item.number));
     }
     return found;
 }
 
-// Where a tensor lies in the data, and its sizes.
+// A tensor in the data: its name, its shape, and the bytes from `first` up to, not including, `last`.
 struct Place {
     std::string name;
     std::vector<std::uint64_t> shape;
     std::uint64_t first, last;
 };
 
+// Reads a tensor's entry in the header. `size` is the count of bytes of all data.
 inline Place place(const std::string& name, const Json& entry, std::size_t size) {
-    if (entry.kind != Json::Kind::Object) throw Error("its header has no valid entry of tensor " + name);
+    if (entry.kind != Json::Kind::Object) throw Error("its header has no valid entry for tensor " + name);
     if (entry.at("dtype", Json::Kind::String).string != "F32")
         throw Error("tensor " + name + " is not float32; convert or train it again");
     const auto range = whole(entry.at("data_offsets", Json::Kind::Array), MOST_BYTES);
@@ -110,7 +112,8 @@ inline Place place(const std::string& name, const Json& entry, std::size_t size)
     return made;
 }
 
-// The tensors of a file. They must fill its data from the first byte to the last, as gaps may hide something.
+// The tensors of a file, in the order of its data. They must fill the data without gaps, because a gap could hide
+// something, or mean that tensors were moved.
 inline std::vector<Place> places(const Json& header, std::size_t size) {
     std::vector<Place> made;
     for (std::size_t k = 0; k < header.names.size(); ++k)
@@ -127,14 +130,15 @@ inline std::vector<Place> places(const Json& header, std::size_t size) {
     return made;
 }
 
-// The numbers of a tensor of so many dimensions, all of them finite, and its `shape`.
+// The numbers of a tensor, which must be finite, and its `shape`, which must have `dimensions` sizes.
 inline std::vector<float> tensor(const std::vector<Place>& places, const char* data, const std::string& name,
                                  std::size_t dimensions, std::vector<std::uint64_t>& shape) {
     const auto found = std::find_if(places.begin(), places.end(), [&](const Place& p) { return p.name == name; });
     if (found == places.end()) throw Error("it lacks tensor " + name + "; copy or train it again");
     shape = found->shape;
     if (shape.size() != dimensions || *std::max_element(shape.begin(), shape.end()) > WIDEST)
-        throw Error("tensor " + name + " has a shape that makes no sense");
+        throw Error("tensor " + name + " has the wrong number of dimensions, or a size above " +
+                    std::to_string(WIDEST));
     std::vector<float> values((found->last - found->first) / sizeof(float));
     if (!values.empty()) std::memcpy(values.data(), data + found->first, values.size() * sizeof(float));
     for (const float v : values)
@@ -160,19 +164,22 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
     return made;
 }
 
+// The field `name`, which must be a whole number in 1 .. most.
 inline int small(const Json& entry, std::string_view name, int most) {
     const double n = entry.at(name, Json::Kind::Number).number;
     if (!(n >= 1 && n <= most) || n != std::floor(n))
-        throw Error("its metadata has a senseless '" + std::string(name) + "'");
+        throw Error("in its metadata, '" + std::string(name) + "' is not a whole number in 1 .. " +
+                    std::to_string(most));
     return static_cast<int>(n);
 }
 
+// Whether the field `name` exists and is true.
 inline bool flag(const Json& entry, std::string_view name) {
     const Json* found = entry.find(name);
     return found && found->kind == Json::Kind::Boolean && found->boolean;
 }
 
-// The fields `low` and `high`. They are finite, as JSON has no word for infinity and the reader refuses large numbers.
+// The fields `low` and `high`. They are finite: JSON has no infinity, and its reader refuses what no double can hold.
 inline std::pair<double, double> range(const Json& entry) {
     return {entry.at("low", Json::Kind::Number).number, entry.at("high", Json::Kind::Number).number};
 }
@@ -217,7 +224,8 @@ inline TargetParam target_param(const Json& entry) {
     return p;
 }
 
-// The parameters of the only material, from the record of its fit. Empty unless the network reads the direction alone.
+// The parameters of the material that the network was fitted to, from the record of the fit. Empty if the network reads
+// parameters, or if no material is recorded.
 inline std::vector<float> material(const Json& about, const Weights& made) {
     std::size_t size = 0;
     for (const SourceParam& p : made.parameters) size += static_cast<std::size_t>(p.size);
@@ -242,7 +250,7 @@ inline Weights weights(const char* bytes, std::size_t size) {
     const Json& metadata = header.at("__metadata__", Json::Kind::Object);
     const Json about = Json::parse(metadata.at("nma", Json::Kind::String).string);
     if (about.at("format", Json::Kind::Number).number != FORMAT)
-        throw Error("another format than this version reads; upgrade the runtime");
+        throw Error("it has a format that this version does not read; upgrade the runtime");
     Weights made;
     made.class_name = about.at("class_name", Json::Kind::String).string;
     made.encoding = about.at("encoding", Json::Kind::String).string;
@@ -255,28 +263,29 @@ inline Weights weights(const char* bytes, std::size_t size) {
     made.material = material(about, made);
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
-    if (hidden.size() >= DEEPEST) throw Error("a network of too many layers");
+    if (hidden.size() >= DEEPEST) throw Error("its network has too many layers");
     const char* data = bytes + 8 + length;
     made.layers =
         layers(places(header, size - 8 - static_cast<std::size_t>(length)), data, static_cast<int>(hidden.size()) + 1);
     for (std::size_t k = 0; k < hidden.size(); ++k)
         if (static_cast<std::uint64_t>(made.layers[k].out) != hidden[k])
-            throw Error("its hidden layers are not those of its metadata");
+            throw Error("its hidden layers do not have the widths in its metadata");
     return made;
 }
 
 }  // namespace detail
 
-// The contents of a weights file in memory. Throws `Error`.
+// Reads the bytes of a weights file. Throws `Error`.
 inline Weights parse_weights(const void* bytes, std::size_t size) {
     return detail::weights(static_cast<const char*>(bytes), size);
 }
 
-// The bytes of a file. Throws `Error`.
+// Returns the bytes of a file. Throws `Error`.
 inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     std::string bytes;
-    // A folder opens, but cannot be read, like a file on a broken disk. Iterators would not throw an `Error` then.
+    // A folder can be opened but not read, and so can a file on a broken disk. `read` then reports a failure. Stream
+    // iterators would throw an exception that is no `Error`.
     for (char block[1 << 14]; file.read(block, sizeof block), file.gcount() > 0;)
         bytes.append(block, static_cast<std::size_t>(file.gcount()));
     if (!file.eof()) throw Error("no such weights file, or it cannot be read");
