@@ -127,8 +127,9 @@ NMA_OP Vec decoded(const Ranges& ranges, int k, Vec raw, float fade) {
     const Vec x = max(min(mul(raw, set(-1.44269504f)), set(120.0f)), set(-120.0f));
     const Vec unit = inverse(add(one, exp2(x)));
     const Vec value = fma(mul(load(ranges.slope + k), faded), unit, mul(load(ranges.start + k), faded));
-    if (k >= ranges.logarithmic) return value;
-    return fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value);
+    return k < ranges.logarithmic
+               ? fma(mul(load(ranges.factor + k), faded), exp2(mul(load(ranges.rate + k), unit)), value)
+               : value;
 }
 
 NMA_FN NMA_WHOLE inline void encode(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
