@@ -87,16 +87,31 @@ def print_function(function: Function) -> str:
 
 
 def _line(function: Function, node: ast.stmt) -> str:
-    """The C++ statement on one line. A longer statement is broken after its `=`, as clang-format would do."""
+    """The C++ statement on one line. A longer one is broken as clang-format would do: after its `=`, or in its list."""
     statement = _statement(function, node)
     name, assigns, value = statement.partition(" = ")
     if 4 + len(statement) <= _WIDTH:
         return f"    {statement}"
     if assigns and 8 + len(value) <= _WIDTH:
         return f"    {name} =\n        {value}"
+    match node:
+        case ast.Return(value=ast.Call(func=ast.Name(id=structure), args=parts)):
+            return _filled(f"    return {_type(structure)}{{", [_expression(function, p) for p in parts])
     raise function.unsupported(
         node, f"a statement too long for {_WIDTH} columns of C++", "assign a part of it to a name"
     )
+
+
+def _filled(head: str, items: list[str]) -> str:
+    """A list in braces that fills its lines; each line begins below the first item."""
+    lines = [head + items[0]]
+    for item in items[1:]:
+        if len(lines[-1]) + len(f", {item},") <= _WIDTH:
+            lines[-1] += f", {item}"
+        else:
+            lines[-1] += ","
+            lines.append(" " * len(head) + item)
+    return "\n".join(lines) + "};"
 
 
 def _comment(doc: str) -> str:

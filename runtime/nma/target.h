@@ -362,9 +362,8 @@ inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
 template <class T>
 inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
     const auto weight = schlick_weight<T>(cos_theta_i);
-    const auto diffuse = diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>;
-    const auto spec = spec_albedo<T>(p, cos_theta_i) + MIN_ALBEDO<T>;
-    return Albedos<T>{diffuse, spec, clearcoat_albedo<T>(p, cos_theta_i, weight)};
+    return Albedos<T>{diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>,
+                      spec_albedo<T>(p, cos_theta_i) + MIN_ALBEDO<T>, clearcoat_albedo<T>(p, cos_theta_i, weight)};
 }
 
 // A direction with density cos(theta) / pi.
