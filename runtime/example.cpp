@@ -1,4 +1,4 @@
-// Prints the directional albedo of a material by sampling it: what a renderer does at every shading point.
+// Prints the directional albedo of a material. It samples the material, as a renderer does at every shading point.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example.cpp -o example
 //     ./example nma/adapter/trained/layered3-5x64.safetensors
@@ -7,7 +7,7 @@
 #include <cstdio>
 #include <random>
 
-// Gold of width .1 under a red coat of width .02 and index 1.5: the parameters of the class in CONVENTIONS.md.
+// Gold of microfacet width .1 under a red coat of width .02 and index 1.5. CONVENTIONS.md lists the parameters.
 constexpr float RED_GOLD[13] = {.02f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
 
 int main(int count, char** words) {
@@ -17,7 +17,7 @@ int main(int count, char** words) {
     }
     try {
         const nma::Adapter adapter = nma::Adapter::load(words[1]);
-        if (adapter.parameter_count() != 13) throw nma::Error("this example wants an adapter of the class layered3");
+        if (adapter.parameter_count() != 13) throw nma::Error("this example needs an adapter of the class layered3");
         std::mt19937 engine(1);
         std::uniform_real_distribution<float> uniform;
         std::printf("cos(theta_i)   red   green    blue\n");

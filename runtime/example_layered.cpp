@@ -1,13 +1,17 @@
-// Light of a small lamp that the simulated material itself reflects, and what its density is for.
+// Estimates the light of a small lamp that the simulated material reflects, in four ways that agree on average. Two of
+// them use its density `pdf`.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered
 //
-// A walk leaves where the material sends it, and so seldom meets a small lamp. `evaluate` looks at the lamp, and so
-// misses what makes a narrow lobe bright. A path tracer does both and weighs each by the odds that the other finds the
-// same light (Veach 1997, eq. 9.8). That needs densities, but a walk has none in closed form. Any density will do, as
-// long as both ways use the same; `pdf` is close to the walk's, so its weights are good. Blends and masks of materials
-// recombine samples by their densities. Such samples must follow their density exactly, as those of `sample` do.
+// - Walks alone: a walk leaves in a direction of the material's choice, which seldom meets a small lamp.
+// - Evaluation alone: `evaluate` takes directions to the lamp, and most of them miss the peak of a narrow lobe.
+// - Both: a path tracer does both, and weighs each sample by the densities of both ways (Veach 1997, eq. 9.8). The
+//   density of a walk has no closed form. Any density will do, as long as both ways use the same. `pdf` is close to the
+//   density of a walk, so its weights are good.
+// - `sample`: blends and masks of materials recombine samples by their densities. Such samples must follow their
+// density
+//   exactly. Those of `sample` follow `pdf`.
 #include <cstdio>
 
 #include "nma/layered.h"
@@ -17,7 +21,7 @@ using layered::Vec;
 
 // Gold under a red coat: the parameters of the class in CONVENTIONS.md.
 constexpr float GOLD[13] = {.01f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
-// A round lamp of radiance 1. It fills the directions whose cosine to its middle is larger than this.
+// A round lamp of radiance 1. It fills all directions whose cosine to the centre of the lamp is larger than LAMP_COS.
 constexpr float LAMP_COS = .95f;
 constexpr float LAMP_PDF = nma::INV_PI<float> / (2.0f * (1.0f - LAMP_COS));
 const Vec VIEW{.6f, 0.0f, .8f}, LAMP{-.8f, 0.0f, .6f};
@@ -39,7 +43,7 @@ struct Estimate {
 
 bool lit(const Vec& wo) { return nma::dot(wo, LAMP) > LAMP_COS; }
 
-// A direction to the lamp, uniformly.
+// A direction to the lamp, drawn uniformly from all of them.
 Vec towards_lamp(float u1, float u2) {
     const float z = 1.0f - u1 * (1.0f - LAMP_COS), r = nma::safe_sqrt(1.0f - z * z), phi = 2.0f * nma::PI<float> * u2;
     const Vec across{LAMP.z, 0.0f, -LAMP.x};
@@ -60,7 +64,7 @@ int main() {
         const Vec wo = towards_lamp(random.uniform(), random.uniform());
         const Vec seen = layered::evaluate(gold, VIEW, wo, random) * (1.0f / LAMP_PDF);
 
-        // Odds that a direction within the lamp came from the walk rather than from the lamp.
+        // The weight of a walk among the two ways to draw the direction w within the lamp.
         const auto odds = [&](const Vec& w) {
             return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF);
         };

@@ -20,18 +20,18 @@ namespace {
 
 const nma::Brdf& of(const nma_brdf& brdf) { return *std::launder(reinterpret_cast<const nma::Brdf*>(&brdf)); }
 void put(nma_brdf* to, const nma::Brdf& brdf) { new (to) nma::Brdf(brdf); }
-nma::InstructionSet set_of(int number) { return static_cast<nma::InstructionSet>(number - NMA_PORTABLE); }
+nma::InstructionSet set_of(int value) { return static_cast<nma::InstructionSet>(value - NMA_PORTABLE); }
 nma::Direction direction(const float* v) { return {v[0], v[1], v[2]}; }
 
 constexpr int BLOCK = nma::Adapter::BLOCK;
 
-// Calls `work(first, count)` for blocks of queries, whose first is the number `first` of all.
+// Calls `work(first, count)` for each block of queries. `first` is the index of the block's first query.
 template <class F>
 void in_blocks(int count, F work) {
     for (int first = 0; first < count; first += BLOCK) work(static_cast<size_t>(first), std::min(BLOCK, count - first));
 }
 
-// At most BLOCK of them, for cosines or directions.
+// Prepares at most BLOCK queries. `views` are cosines or directions.
 template <class View>
 void prepare_block(const nma::Adapter& adapter, int count, const float* parameters, const View* views,
                    nma_brdf* brdfs) {
@@ -40,7 +40,7 @@ void prepare_block(const nma::Adapter& adapter, int count, const float* paramete
     for (int k = 0; k < count; ++k) put(brdfs + k, block[k]);
 }
 
-// At most BLOCK directions from their rows.
+// At most BLOCK directions, read from rows of three floats.
 struct Directions {
     nma::Direction wi[BLOCK];
 
@@ -49,7 +49,7 @@ struct Directions {
     }
 };
 
-// What `make` returns, or null with the reason in `message`.
+// Returns the adapter that `make` returns. If `make` throws, returns null and writes the reason to `message`.
 template <class F>
 nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
     const auto fail = [&](const char* reason) -> nma_adapter* {
@@ -91,9 +91,9 @@ nma_adapter* nma_from_memory(const void* bytes, size_t length, int set, char* me
 void nma_free(nma_adapter* adapter) { delete adapter; }
 
 int nma_parameter_count(const nma_adapter* a) { return a->adapter.parameter_count(); }
-const char* nma_parameter_name(const nma_adapter* a, int number) { return a->adapter.parameter(number).name.c_str(); }
-void nma_parameter_range(const nma_adapter* a, int number, float range[2]) {
-    const nma::SourceParam& p = a->adapter.parameter(number);
+const char* nma_parameter_name(const nma_adapter* a, int index) { return a->adapter.parameter(index).name.c_str(); }
+void nma_parameter_range(const nma_adapter* a, int index, float range[2]) {
+    const nma::SourceParam& p = a->adapter.parameter(index);
     range[0] = static_cast<float>(p.low);
     range[1] = static_cast<float>(p.high);
 }

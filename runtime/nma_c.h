@@ -1,8 +1,8 @@
-/* Neural Material Adapter for C, and for whatever calls C: see nma.h for what the functions do.
+/* Neural Material Adapter for C, and for languages that can call C. nma.h explains what the functions do.
  *
- * Compile nma_c.cpp beside your code, or link the library nma_c. Pointers are to arrays of floats; directions are unit
- * vectors in the local frame, z up. An adapter may be shared by threads. Only loading and `nma_curves_new` can fail:
- * they return NULL, and loading says why in `message`. */
+ * Compile nma_c.cpp with your code, or link the library nma_c. Pointers to floats are arrays. Directions are unit
+ * vectors in the local frame, z up. Many threads may share an adapter. Only loading and `nma_curves_new` can fail: they
+ * return NULL, and loading writes the reason to `message`. */
 #ifndef NMA_C_H
 #define NMA_C_H
 
@@ -29,17 +29,17 @@ typedef struct nma_curves nma_curves;
 #define NMA_ALIGNED __attribute__((aligned(16)))
 #endif
 
-/* A BRDF at one shading point, on a boundary of 16 bytes. */
+/* A BRDF at one shading point. Its address must be a multiple of 16 bytes. */
 typedef struct {
     NMA_ALIGNED float opaque[168];
 } nma_brdf;
-/* What it was called before. */
+/* The former name of `nma_brdf`. */
 typedef nma_brdf nma_material;
-/* The bytes of one, for languages that do not read this header. */
+/* The size of an `nma_brdf` in bytes, for languages that do not read this header. */
 NMA_C_API size_t nma_brdf_size(void);
 
-/* In the order of nma::InstructionSet. NMA_FASTEST is the fastest one here that computes in float32. Add NMA_COMPACT to
- * one to have weights rounded to bfloat16: nma::Options. */
+/* The instruction sets, in the order of nma::InstructionSet. NMA_FASTEST is the fastest supported instruction set that
+ * computes in float32. Add NMA_COMPACT to an instruction set to round the weights to bfloat16: see nma::Options. */
 enum { NMA_FASTEST, NMA_PORTABLE, NMA_NEON, NMA_AVX2, NMA_AVX512, NMA_AVX512_BF16, NMA_COMPACT = 0x100 };
 NMA_C_API int nma_supported(int instruction_set);
 
@@ -49,48 +49,51 @@ NMA_C_API nma_adapter* nma_from_memory(const void* bytes, size_t size, int instr
 NMA_C_API void nma_free(nma_adapter* adapter);
 
 NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
-/* Of the parameter number `number`, counted from 0: the parameter's name, and its training range, low and high. */
-NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int number);
-NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int number, float range[2]);
-/* Whether it knows a single material of its class; the parameters of that are written then. */
+/* The parameter that the number with this index belongs to, 0 <= index < nma_parameter_count: its name, and the lower
+ * and upper end of its training range. */
+NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int index);
+NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int index, float range[2]);
+/* Whether the adapter was fitted to a single material. If so, writes the parameters of that material. */
 NMA_C_API int nma_single_material(const nma_adapter* adapter, float* parameters);
-/* The first number that is not finite or beyond its training range, where values are made up, or not of the single
- * material that it knows; -1 if there is none. */
+/* The index of the first number that is not finite or lies beyond its training range, where the network makes up
+ * values. If the adapter was fitted to a single material: of the first number that is not that material's. -1 if there
+ * is no such number. */
 NMA_C_API int nma_check(const nma_adapter* adapter, const float* parameters);
-/* Moves each into its training range, NaN to the lower end. */
+/* Moves each number into its training range, and NaN to the lower end. */
 NMA_C_API void nma_clamp(const nma_adapter* adapter, float* parameters);
 NMA_C_API int nma_output_count(const nma_adapter* adapter);
 NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
-/* Whether the view's azimuth matters. Cosines alone stand for the azimuth 0 then: give directions. */
+/* Whether the azimuth of the view matters. If so, functions that take a cosine use the azimuth 0; pass directions. */
 NMA_C_API int nma_anisotropic(const nma_adapter* adapter);
 
 NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i, nma_brdf* brdf);
 NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters,
                                 const float* cos_theta_i, nma_brdf* brdfs);
 
-/* The same seen from directions, three floats each; of isotropic adapters only their z matters. */
+/* The same functions for directions `wi`, three floats each. Isotropic adapters read only z. */
 NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi,
                                      nma_brdf* brdf);
 NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters,
                                           const float* wi, nma_brdf* brdfs);
 
-/* Raw outputs of the network, `nma_output_count` for each query. */
+/* The raw outputs of the network: `nma_output_count` numbers for each query. */
 NMA_C_API void nma_outputs_many(const nma_adapter* adapter, int count, const float* parameters,
                                 const float* cos_theta_i, float* outputs);
 NMA_C_API void nma_outputs_direction_many(const nma_adapter* adapter, int count, const float* parameters,
                                           const float* wi, float* outputs);
 
-/* Curves of an untextured material. NULL for an anisotropic adapter, which has none, and where memory is short. */
+/* The curves of an untextured material. NULL if the adapter is anisotropic, or if memory runs out. */
 NMA_C_API nma_curves* nma_curves_new(const nma_adapter* adapter, const float* parameters);
 NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_brdf* brdf);
 NMA_C_API void nma_curves_free(nma_curves* curves);
 
-/* For each BRDF: `value_pdf` gets f cos(theta_o) [1/sr] as RGB and the density [1/sr]; `wo_value_pdf` a direction
- * before them, drawn with three uniform numbers in [0, 1) from `u`. A density of 0 marks an invalid direction. */
+/* For each BRDF, `nma_eval_pdf` writes four floats: f cos(theta_o) [1/sr] as RGB, and the density [1/sr]. `nma_sample`
+ * draws a direction by three uniform numbers in [0, 1) from `u`, and writes seven floats: the direction, and the same
+ * four. A density of 0 marks an invalid direction. */
 NMA_C_API void nma_eval_pdf(int count, const nma_brdf* brdfs, const float* wi, const float* wo, float* value_pdf);
 NMA_C_API void nma_sample(int count, const nma_brdf* brdfs, const float* wi, const float* u, float* wo_value_pdf);
 
-/* For each BRDF the directional albedo at `wi` as RGB, at most 1, without noise. */
+/* For each BRDF, writes the directional albedo at `wi` as RGB, at most 1, without noise. */
 NMA_C_API void nma_albedo(int count, const nma_brdf* brdfs, const float* wi, float* albedo);
 
 #ifdef __cplusplus

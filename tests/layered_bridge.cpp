@@ -1,4 +1,5 @@
-// What tests/test_runtime_layered.py calls: the simulated material's density, samples of it, estimates, walks, albedos.
+// The functions that tests/test_runtime_layered.py calls: densities, samples, estimates, walks and albedos of the
+// simulated material.
 #include "nma/layered.h"
 
 #include <algorithm>
@@ -13,7 +14,7 @@ constexpr Vec NOTHING{0.0f, 0.0f, 0.0f};
 Vec vec(const float* v) { return {v[0], v[1], v[2]}; }
 void put(const Vec& v, float* to) { std::copy_n(&v.x, 3, to); }
 
-// Sums of weights and of their squares over the bins of a table, as nma/table lays them out: [row, o, p, rgb].
+// The sums of weights, and of their squares, over the bins of a table. nma/table has the same layout: [row, o, p, rgb].
 struct Bins {
     int o, p;
     double *sums, *squares;
@@ -30,13 +31,13 @@ struct Bins {
     }
 };
 
-// A direction of the row, at azimuth 0.
+// A random view direction of the row, at azimuth 0.
 Vec view(int row, int rows, layered::Random& random) {
     const float z = (static_cast<float>(row) + random.uniform()) / static_cast<float>(rows);
     return {nma::safe_sqrt(1.0f - z * z), 0.0f, z};
 }
 
-// A direction that follows the density, and the estimate there over it.
+// A direction that follows the density. Its throughput is an estimate of the value, divided by the density.
 layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Random& random) {
     const layered::Density density(stack, wi);
     const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
@@ -49,20 +50,20 @@ layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Rand
 
 extern "C" {
 
-// All for one material, seen from one direction; rows of `wo`.
+// Densities for one material, seen from one direction. `wo` has a row for each.
 void layered_pdf(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
     const auto stack = layered::Stack::of(parameters);
     const layered::Density density(stack, vec(wi));
     for (int i = 0; i < n; ++i) pdf[i] = layered::pdf(stack, density, vec(wi), vec(wo + 3 * i));
 }
 
-// The same for a material and a view in each row.
+// Densities for a material, a view and a `wo` in each row.
 void layered_pdf_each(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
     constexpr int COLUMNS = nma::layered3::COLUMNS;
     for (int i = 0; i < n; ++i) layered_pdf(1, parameters + COLUMNS * i, wi + 3 * i, wo + 3 * i, pdf + i);
 }
 
-// Rows of three uniform numbers to rows of wo, its density, and an estimate of the value.
+// `u` has rows of three uniform numbers. `out` gets rows of seven: wo, its density, and an estimate of the value.
 void layered_sample(int n, const float* parameters, const float* wi, const float* u, float* out) {
     const auto stack = layered::Stack::of(parameters);
     const layered::Density density(stack, vec(wi));
@@ -75,14 +76,14 @@ void layered_sample(int n, const float* parameters, const float* wi, const float
     }
 }
 
-// Rows of throughputs.
+// Writes the throughputs of n walks, three floats each.
 void layered_walks(int n, const float* parameters, const float* wi, float* out) {
     const auto stack = layered::Stack::of(parameters);
     layered::Random random(3, 4);
     for (int i = 0; i < n; ++i) put(layered::walk(stack, vec(wi), random).throughput, out + 3 * i);
 }
 
-// Tables from `per_row` walks, or estimates, from each row of views.
+// Fills a table from walks, or else from estimates: `per_row` of them for each row of views.
 void layered_table(bool walks, int rows, int o, int p, int per_row, int seed, const float* parameters, double* sums,
                    double* squares) {
     const auto stack = layered::Stack::of(parameters);

@@ -1,5 +1,5 @@
-// What tests of the runtime call beside the C interface: the target on arrays, in float and in double, and the numbers
-// in a BRDF.
+// The functions that tests of the runtime call in addition to the C interface: the target on arrays, in float and in
+// double, and the numbers in a BRDF.
 #include "nma.h"
 #include "nma_c.h"
 
@@ -7,7 +7,8 @@ namespace {
 
 constexpr int FIELDS = nma::Blend<float>::FIELDS;
 
-// The fields of an instance in the order of `Principled`, then for the next one, and all weights at the end.
+// A blend from its numbers: the fields of the first instance in the order of `Principled`, those of the second, and so
+// on, and then all weights.
 template <class T>
 nma::Blend<T> blend_of(const T* numbers, int count) {
     nma::Blend<T> made(count);
@@ -43,7 +44,7 @@ void evaluate_double(int n, int count, bool bounded, const double* blends, const
     evaluate(n, count, bounded, blends, wi, wo, out);
 }
 
-// Rows of wo, value and pdf.
+// Writes rows of seven numbers: wo, value and pdf.
 void sample_double(int n, int count, const double* blends, const double* wi, const double* u, double* out) {
     for (int i = 0; i < n; ++i, blends += (FIELDS + 1) * count, wi += 3, u += 3, out += 7) {
         nma::Blend<double> blend = blend_of(blends, count);
@@ -54,7 +55,7 @@ void sample_double(int n, int count, const double* blends, const double* wi, con
     }
 }
 
-// Of BRDFs as the C interface makes them: the fields of all instances, then their weights.
+// Writes the numbers of BRDFs that the C interface made: the fields of all instances, then their weights.
 void brdf_numbers(int n, int count, const nma_brdf* brdfs, float* out) {
     for (int i = 0; i < n; ++i, out += (FIELDS + 1) * count) {
         const nma::Blend<float>& blend = reinterpret_cast<const nma::Brdf*>(brdfs + i)->blend();

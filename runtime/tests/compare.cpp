@@ -56,8 +56,8 @@ int main(int count, char** words) {
                 worst = std::max(worst, error);
                 squares += error * error;
             }
-            // bfloat16 keeps 8 bits of each activation. In float32 the order of a sum changes the rounding of its
-            // terms, which are larger than the outputs.
+            // bfloat16 keeps 8 significant bits of each activation. In float32, instruction sets add in different
+            // orders, so sums are rounded differently. The terms of a sum are larger than the outputs.
             const bool rounded = set == nma::InstructionSet::avx512_bf16;
             const double rms = std::sqrt(squares / static_cast<double>(wanted.size()));
             fine &= rounded ? rms < 0.02 : rms < 1e-6 && worst < 3e-5;

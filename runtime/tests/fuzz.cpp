@@ -51,7 +51,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
 #else
 namespace {
 
-// One to four changes of a file, most of them in its header.
+// Returns the file with one to four changes, most of them in its header.
 std::string changed(std::string bytes, std::mt19937& engine) {
     static constexpr const char* WORDS[] = {
         "null", "-1", "1e308", "[", "}", "\"", "\\u0000", "0", "4096", "true", "layer0.weight", "99999999999999999999"};

@@ -1,4 +1,4 @@
-// What the programs here share: random numbers, materials and directions, and what is sound.
+// The common part of the programs in this folder: random numbers, materials and directions, and a check of values.
 #pragma once
 
 #include <random>
@@ -7,7 +7,7 @@
 
 namespace nma::tests {
 
-// Uniform numbers in [0, 1), now and then an end of the range.
+// Uniform numbers in [0, 1). One of 256 is an end of the range: 0, or the largest float below 1.
 class Random {
 public:
     explicit Random(unsigned seed) : engine_(seed) {}
@@ -21,7 +21,7 @@ private:
     std::mt19937 engine_;
 };
 
-// Numbers within their ranges: by powers where those are logarithmic, else uniformly.
+// Draws each number from its range. The logarithm of a logarithmic parameter is uniform, any other number is uniform.
 inline void draw_parameters(const std::vector<SourceParam>& parameters, Random& random, float* to) {
     for (const SourceParam& p : parameters)
         for (int c = 0; c < p.size; ++c) {
@@ -30,7 +30,7 @@ inline void draw_parameters(const std::vector<SourceParam>& parameters, Random& 
         }
 }
 
-// Over the hemisphere, now and then at the pole or near the horizon.
+// Draws a direction, uniformly over the upper hemisphere. Two of 100 are the normal, eight are close to the horizon.
 inline Vec3<float> draw_direction(Random& random) {
     const float choice = random(), u = random(), phi = 6.2831853f * random();
     const float z = choice < 0.02f ? 1.0f : choice < 0.1f ? 1e-4f * u + 1e-6f : u;

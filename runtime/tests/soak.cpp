@@ -1,7 +1,7 @@
 // Millions of random materials and directions: nothing is NaN, infinite or negative, and samples agree with eval_pdf.
 //
 //     c++ -std=c++17 -O2 -pthread -Iruntime runtime/tests/soak.cpp -o soak
-//     ./soak CALLS WEIGHTS        calls of eval_pdf, pdf and sample together; threads share the adapter
+//     ./soak CALLS WEIGHTS        CALLS counts eval_pdf, pdf and sample together; threads share the adapter
 #include "nma.h"
 
 #include <atomic>
@@ -22,7 +22,7 @@ constexpr float TOLERANCE = 1e-4f;
 
 bool close(float a, float b) { return std::abs(a - b) <= TOLERANCE * std::max(std::abs(a), std::abs(b)); }
 
-// A material, and `CALLS_PER_ROUND` calls. Returns what is wrong, or null.
+// Prepares a random material and makes CALLS_PER_ROUND calls. Returns the name of what is wrong, or null.
 const char* round_of_calls(const nma::Adapter& adapter, Random& random) {
     float parameters[64];
     nma::tests::draw_parameters(adapter.parameters(), random, parameters);

@@ -1,7 +1,8 @@
-// The simulated material over all that its class allows, and where it is hard: nothing is NaN, infinite or negative.
+// The simulated material, for random materials of its class and for the hardest ones: nothing is NaN, infinite or
+// negative.
 //
 //     c++ -std=c++17 -O2 -Iruntime runtime/tests/soak_layered.cpp -o soak_layered
-//     ./soak_layered CALLS        calls of walk, evaluate, pdf, sample and albedo together
+//     ./soak_layered CALLS        CALLS counts walk, evaluate, pdf, sample and albedo together
 #include <cstdio>
 #include <cstdlib>
 
@@ -17,7 +18,7 @@ using nma::tests::sound;
 
 constexpr int CALLS_PER_ROUND = 8;
 
-// Smooth and rough, thin and thick, index-matched, and such that nothing is absorbed.
+// Hard materials: smooth and rough, thin and thick, index-matched, and without absorption.
 constexpr float HARD[][nma::layered3::COLUMNS] = {
     {1e-4f, 1e-4f, 1.0f, 0.24f, 0.96f, 1.18f, 3.9f, 2.6f, 2.4f, 0.9f, 0.5f, 0.1f, 1.0f},
     {1e-3f, 2e-3f, 1.5f, 0.24f, 0.96f, 1.18f, 3.9f, 2.6f, 2.4f, 0.8f, 0.8f, 0.8f, 0.3f},
@@ -26,7 +27,7 @@ constexpr float HARD[][nma::layered3::COLUMNS] = {
     {0.3f, 2e-3f, 1.05f, 1e4f, 0.0f, 1e4f, 0.0f, 1e4f, 1e4f, 0.0f, 0.5f, 1.0f, 4.0f},
 };
 
-// A material, and `CALLS_PER_ROUND` calls. Returns what is wrong, or null.
+// Makes CALLS_PER_ROUND calls for a material. Returns the name of what is wrong, or null.
 const char* round_of_calls(const layered::Stack& stack, nma::tests::Random& random, layered::Random& walking) {
     const layered::Vec wi = draw_direction(random);
     const layered::Density density(stack, wi);
