@@ -1,6 +1,6 @@
-"""Hard cases of the layered material, and Z-tests of tables, which tests in Python and in C++ share.
+"""Hard cases of the layered material and Z-tests of tables, shared by the tests of the Python and the C++ code.
 
-A statistical test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's correction.
+Each statistical test has the false-alarm rate `FALSE_ALARM` over all of its comparisons (Sidak's correction).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ GRID = Grid(theta_i=5, theta_o=10, phi_o=10)
 WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
 COPPER = {"eta_conductor": (0.24, 0.96, 1.18), "k_conductor": (3.9, 2.6, 2.4)}
 
-# Narrow and wide lobes of coat and conductor, thin and thick media, and coats that refract light much, little or not.
+# Narrow and wide lobes of coat and conductor, thin and thick media, and coats of high, low and matched index.
 CASES = {
     "white_coated": {"alpha_top": 0.2, "alpha_bottom": 0.4, "eta_top": 1.5, "sigma_t": 0.0, **WHITE},
     "white_with_medium": {
@@ -45,12 +45,15 @@ def vector(values):
 
 
 def limit(comparisons):
-    """The |z| above which one of this many two-sided Z-tests rejects."""
+    """Returns the |z| above which one of `comparisons` two-sided Z-tests rejects."""
     return norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / comparisons)))
 
 
 def table_of(sums, squares, per_row):
-    """The bin means (theta_i, theta_o, phi, 3) and their standard errors, from sums over `per_row` weights per row."""
+    """Returns the means of bins (theta_i, theta_o, phi, 3) and their standard errors.
+
+    `sums` and `squares` are sums of weights and of squared weights in each bin, from `per_row` weights per row.
+    """
     scale = 1.0 / (per_row * GRID.solid_angle)
     return sums * scale, np.sqrt(squares - sums**2 / per_row) * scale
 

@@ -24,7 +24,7 @@ CASES = {
     "thick": {"alpha_top": 0.15, "alpha_bottom": 1.0, "eta_top": 1.3, "sigma_t": 3.0},
     "index_matched": {"alpha_top": 0.2, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 0.3},
 }
-# Lobes too narrow for bins, whose means are tested all the same.
+# These lobes are too narrow for the bins of a chi-square test. Their mean values are tested.
 NARROW = {"alpha_top": 0.002, "alpha_bottom": 0.02, "eta_top": 1.5, "sigma_t": 0.5}
 COSINES = (1.0, 0.6, 0.1)
 ESTIMATORS = pytest.mark.parametrize("estimator", ["walk", "estimate"])
@@ -40,11 +40,14 @@ def view(mu):
 
 @pytest.fixture(scope="module")
 def bridge(compiler, tmp_path_factory):
-    # The same roundings as Dr.Jit's: compilers may fuse products and sums where the processor can.
+    # Dr.Jit does not fuse products and sums. This flag keeps the compiler from it, so that both round in the same way.
     library = built(compiler, "layered_bridge.cpp", tmp_path_factory.mktemp("layered"), "-ffp-contract=off")
 
     def call(name, inputs, shape):
-        """Calls the function for rows of outputs; it wants their number first where there are several."""
+        """Calls a C function and returns its outputs as an array of this shape.
+
+        All functions but `layered_albedo` have the count of rows as their first argument.
+        """
         out = np.empty(shape, np.float32)
         count = [ctypes.c_int(shape[0])] if name != "layered_albedo" else []
         arrays = [np.ascontiguousarray(a, np.float32) for a in inputs]
@@ -64,7 +67,10 @@ def vec3(rows):
 
 
 def random_materials(rng, n):
-    """(n, 13) float32: a third from the training ranges, a third from all that is valid, a third of the hard cases."""
+    """Returns n random materials, float32 (n, 13).
+
+    A third is drawn from the training ranges, a third from the valid ranges, and a third from the hard cases.
+    """
     low, high = LAYERED3.columns("valid")
     powers = [low[:2], np.maximum(low[2:], 1e-3)], [high[:2], np.minimum(high[2:], 100.0)]
     low, high = (np.concatenate(ends) for ends in powers)
@@ -75,14 +81,14 @@ def random_materials(rng, n):
 
 
 def random_views(rng, n):
-    """Directions (n, 3), a quarter of them down to the horizon."""
+    """Returns random directions (n, 3). A quarter of them is spread evenly over decades of the cosine, down to 1e-4."""
     z = np.where(rng.random(n) < 0.25, 10.0 ** rng.uniform(-4, 0, n), rng.random(n))
     phi, r = 2.0 * np.pi * rng.random(n), np.sqrt(1.0 - z * z)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
 
 
 def beside_the_mirror(rng, wi, params):
-    """Directions within the lobe of the coat or of the conductor."""
+    """Returns directions (n, 3) within the lobe of the coat or of the conductor."""
     n = len(wi)
     alpha = np.where(rng.random(n) < 0.5, params[:, 0], params[:, 1])
     tilt, turn = alpha * np.tan(0.45 * np.pi * rng.random(n)), 2.0 * np.pi * rng.random(n)
@@ -92,8 +98,11 @@ def beside_the_mirror(rng, wi, params):
 
 
 def test_density_is_that_of_the_package_case_by_case(bridge):
-    """Both compute in single precision with the same roundings, so they agree better than either does with the exact
-    density: at grazing angles an index-matched coat reflects by rounding alone."""
+    """The density in C++ equals that of the package within 1e-4, for 4,000 materials and pairs of directions.
+
+    Both compute in single precision and round in the same way, so that they agree better with each other than with the
+    exact density. An index-matched coat at grazing angles, for example, reflects only by rounding.
+    """
     rng, n = np.random.default_rng(0), 4000
     params, wi, wo = random_materials(rng, n), random_views(rng, n), random_views(rng, n)
     beside = beside_the_mirror(rng, wi, params)
@@ -120,7 +129,7 @@ def test_samples_are_those_of_the_package(bridge):
             expected = np.stack([x.numpy() for x in drawn], axis=-1)
             found = bridge("layered_sample", (vector(values), wi, u), (len(u), 7))
             valid = expected[:, 2] > 0
-            # Where lobes meet a rounding chooses another one, and at the horizon whether there is a direction.
+            # Rounding may choose the other lobe near a border, or change whether a sample lies above the horizon.
             assert (valid == (found[:, 3] > 0)).mean() > 0.998
             assert (np.abs(found[:, :3] - expected).max(axis=1) < 1e-3)[valid].mean() > 0.998
 
@@ -131,15 +140,16 @@ def hard(case):
 
 @cache
 def reference(case, walks=1 << 20):
-    """The package's table of a hard case."""
+    """Returns the table of a hard case, simulated by the package."""
     return tabulate(Layered3(), hard(case)[None], walks, stream_keys(3, range(1)), grid=GRID)
 
 
 def scores(bridge, estimator, params, tables, per_row=1 << 18, seed=5):
-    """|z| of the C++ walk, or of its estimate, minus the package's walks.
+    """Returns |z| of the difference between a table in C++ and a table of the package's walks.
 
-    An estimate counts in bins where its relative error is below 3 %. Rare bright weights carry the other bins if the
-    coat is rough and the conductor smooth, and a sample without such a weight underrates its own error.
+    The estimator in C++ is "walk" or "estimate". Estimates are compared only in bins with a relative error below 3 %.
+    In other bins rare bright weights dominate if the coat is rough and the conductor smooth, and samples without such
+    a weight underestimate their error.
     """
     sums, squares = np.zeros((2, *GRID.shape))
     about = np.ascontiguousarray(params, np.float32)
@@ -150,21 +160,24 @@ def scores(bridge, estimator, params, tables, per_row=1 << 18, seed=5):
 
 
 def bent_more(params):
-    """The same material under a coat whose index is two per cent higher."""
+    """Returns the parameters of the same material with an index of the coat that is 2 % higher."""
     return np.where(np.arange(len(params)) == 2, 1.02 * params, params)
 
 
 @ESTIMATORS
 @pytest.mark.parametrize("case", layered_cases.CASES)
 def test_every_bin_is_that_of_the_package(bridge, case, estimator):
-    """By the walk and by the estimate, over the package's walks; z of all bins, and of their sums."""
+    """Walks and estimates in C++ have the same means as walks of the package, in bins and in sums of bins.
+
+    These are Z-tests. The false-alarm rate is `FALSE_ALARM` per case; seeds are fixed.
+    """
     z = scores(bridge, estimator, hard(case), reference(case))
     assert z.size > 0.1 * GRID.bins
     assert z.max() < limit(z.size), f"z {z.max():.1f} beyond {limit(z.size):.1f}"
 
 
 @ESTIMATORS
-def test_bins_would_show_an_index_that_is_two_percent_off(bridge, estimator):
+def test_the_comparison_of_bins_detects_an_index_that_is_two_percent_off(bridge, estimator):
     z = scores(bridge, estimator, bent_more(hard("wide_narrow")), reference("wide_narrow"))
     assert z.max() > limit(z.size)
 
@@ -172,7 +185,7 @@ def test_bins_would_show_an_index_that_is_two_percent_off(bridge, estimator):
 @pytest.mark.slow
 @ESTIMATORS
 @pytest.mark.parametrize("case", layered_cases.CASES)
-def test_eight_times_as_many_walks_still_agree_and_show_the_wrong_index_everywhere(bridge, case, estimator):
+def test_eight_times_as_many_walks_agree_and_detect_the_wrong_index_in_every_case(bridge, case, estimator):
     about = reference(case, 1 << 23), 1 << 20
     right, wrong = (scores(bridge, estimator, p, *about) for p in (hard(case), bent_more(hard(case))))
     assert right.size > 0.5 * GRID.bins
@@ -192,7 +205,7 @@ def test_every_bin_of_random_materials_is_that_of_the_package(bridge, estimator)
 
 @pytest.mark.slow
 def test_samples_follow_the_density(bridge):
-    """Chi-square tests; a correct sampler fails one of them with a chance of 1e-3."""
+    """Samples in C++ follow their density (chi-square tests, false-alarm rate 1e-3 in all; seeds are fixed)."""
     rng, tests = np.random.default_rng(1), len(CASES) * 2
     for name, values in CASES.items():
         for mu in COSINES[:2]:
@@ -212,7 +225,7 @@ def test_samples_follow_the_density(bridge):
 
 @pytest.mark.parametrize("case", [*CASES, "narrow"])
 def test_weights_of_samples_have_the_mean_of_walks(bridge, case):
-    """The directional albedo by both; Z-tests, a false alarm in a thousand."""
+    """Mean sample weights and mean walks give the same directional albedo (Z-tests, false-alarm rate 1e-3 in all)."""
     n, most = 200_000, limit(3 * len(COSINES))
     about = vector(CASES.get(case, NARROW))
     for mu in COSINES:
@@ -228,7 +241,10 @@ def test_weights_of_samples_have_the_mean_of_walks(bridge, case):
 
 
 def test_albedos_have_no_noise_and_are_close_to_those_of_many_walks(bridge):
-    """A fixed set of 256 walks, whose error is at most .5 / 16 by standard deviation."""
+    """An albedo is the mean of a fixed set of 256 walks, so that it has no noise between calls.
+
+    It is within .1 of the mean of many walks. The standard deviation of 256 walks is at most .5 / 16.
+    """
     for values in (*CASES.values(), NARROW):
         for mu in COSINES:
             about = vector(values), view(mu)
