@@ -47,7 +47,7 @@ public:
     // The density of `sample` [1/sr], 0 below the horizon.
     float pdf(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).pdf; }
 
-    // The value and the density together, which take no longer than either.
+    // The value and the density together. This takes no longer than one of them.
     Value eval_pdf(const Direction& wi, const Direction& wo) const {
         const Plane<float> plane = frame(wi);
         return nma::eval_pdf(blend_, plane_enter<float>(plane, wi), plane_enter<float>(plane, wo));
@@ -96,11 +96,12 @@ using Material = Brdf;
 
 // How a weights file is loaded.
 struct Options {
-    // If this CPU lacks the instruction set, `portable` runs instead. avx512_bf16 rounds weights and activations to
-    // bfloat16, which keeps 8 significant bits, and takes half the time for a network. The others compute in float32.
+    // If this CPU lacks the instruction set, `portable` runs instead. All instruction sets compute in float32, except
+    // avx512_bf16: it rounds weights and activations to bfloat16, which keeps 8 significant bits. This halves the time
+    // of a network on some CPUs.
     InstructionSet set = fastest();
     // Rounds weights to bfloat16, which halves the memory that a query has to fetch. It raised the log loss of both
-    // shipped adapters by less than .00002. avx512_bf16 rounds weights whatever this says.
+    // shipped adapters by less than .00002. The instruction set avx512_bf16 always rounds weights.
     bool compact = false;
 };
 
@@ -130,7 +131,8 @@ public:
     const std::vector<float>& material() const { return weights_.material; }
     // The index of the first number that is not allowed, or -1. A number is allowed if it is finite and lies in its
     // training range; beyond that range the network makes up plausible values. If the adapter was fitted to a single
-    // material, only the numbers of that material are allowed. `parameter` returns the parameter of an index.
+    // material, only the numbers of that material are allowed. `parameter` finds the parameter that a number belongs
+    // to.
     int check(const float* parameters) const {
         for (int k = 0; k < parameter_count(); ++k)
             if (!allowed(k, parameters[k])) return k;
@@ -249,7 +251,8 @@ private:
         return same(x, material()[k]);
     }
 
-    // Appends the places in `Principled` that the numbers of a target parameter go to, counted in numbers.
+    // Appends the places of a target parameter's numbers. A place is an index in `Principled`, seen as an array of
+    // numbers.
     void add_fields(const TargetParam& p) {
         in_plane_ |= p.in_plane;
         const int first = static_cast<int>(detail::field(p.name, p.size).first);
@@ -272,8 +275,8 @@ private:
             throw Error("the network does not fit its description; train again");
     }
 
-    // Fills in the ranges of all outputs: those of the first instance, of the second, and so on, and then the shares of
-    // the blend, which lie in 0 .. 1. The padding keeps its zeros.
+    // Fills in the ranges of all outputs. The outputs are the parameters of the first instance, of the second, and so
+    // on, and then the shares of the blend, which lie in 0 .. 1. The padding keeps its zeros.
     void lay_out_ranges() {
         const int count = network_.output_stride();
         ranges_ = detail::aligned<float>(5 * static_cast<std::size_t>(count));

@@ -55,9 +55,9 @@ NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int index);
 NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int index, float range[2]);
 /* Whether the adapter was fitted to a single material. If so, writes the parameters of that material. */
 NMA_C_API int nma_single_material(const nma_adapter* adapter, float* parameters);
-/* The index of the first number that is not finite or lies beyond its training range, where the network makes up
- * values. If the adapter was fitted to a single material: of the first number that is not that material's. -1 if there
- * is no such number. */
+/* The index of the first number that is not allowed, or -1. A number is allowed if it is finite and lies in its
+ * training range; beyond that range the network makes up values. If the adapter was fitted to a single material, only
+ * the numbers of that material are allowed. */
 NMA_C_API int nma_check(const nma_adapter* adapter, const float* parameters);
 /* Moves each number into its training range, and NaN to the lower end. */
 NMA_C_API void nma_clamp(const nma_adapter* adapter, float* parameters);

@@ -197,7 +197,7 @@ def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
             runtime.prepare(other, mu, clamp=clamp)
     for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13):
         replace(adapter, training={"params": params}).save(path)
-        with pytest.raises(WeightsError, match="its material is none of class layered3"):
+        with pytest.raises(WeightsError, match="its material does not fit the class layered3"):
             Runtime(path)
     adapter.save(path)
     assert Runtime(path).material is None

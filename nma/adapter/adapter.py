@@ -254,7 +254,7 @@ class Adapter:
                 raise ParamError(f"shape {known.shape}")
         except (ValueError, TypeError) as e:
             raise WeightsError(
-                f"{path}: its material is none of class {self.space.name} ({e}); fit it again"
+                f"{path}: its material does not fit the class {self.space.name} ({e}); fit it again"
             ) from None
 
 

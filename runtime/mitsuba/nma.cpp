@@ -129,7 +129,8 @@ private:
         try {
             nma::Adapter adapter = nma::Adapter::load(fs::exists(path) ? path.string() : name, options);
             if (adapter.parameter_count() > MOST_PARAMETERS)
-                throw nma::Error(name + ": a class of too many parameters");
+                throw nma::Error(name + ": its class has more than " + std::to_string(MOST_PARAMETERS) +
+                                 " numbers as parameters");
             return adapter;
         } catch (const nma::Error& e) {
             Throw("%s", e.what());

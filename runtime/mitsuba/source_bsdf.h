@@ -65,7 +65,7 @@ protected:
     // The directional albedo at si.wi, whose z is positive.
     virtual nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const = 0;
 
-    // Whether the value is 0 for all `wo`: seen from behind, or if the context leaves out glossy reflection.
+    // Whether nothing is reflected: the surface is seen from behind, or the context leaves out glossy reflection.
     static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
         return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
     }

@@ -28,7 +28,7 @@ public:
     explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
 
     std::vector<Texels> found;
-    // Whether each of these textures showed something. Mesh attributes, for one, have no numbers before rendering.
+    // Whether each of these textures showed numbers. Mesh attributes, for example, have none before rendering.
     bool complete = true;
 
 protected:

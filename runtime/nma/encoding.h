@@ -45,8 +45,8 @@ public:
     // Whether the azimuth of `wi` matters. If not, `encode` reads wi.z alone.
     bool anisotropic() const { return kind_ == Kind::Azimuth; }
 
-    // The first layer of a file, changed so that it takes the inputs in the order in which `encode` writes them. For
-    // the encoding `layered3`, that order differs from the order that the network was trained on: `place` shows both.
+    // The first layer of a file, changed so that it takes the inputs in the order in which `encode` writes them. Only
+    // the encoding `layered3` changes the layer: `place` shows its two orders.
     Layer arranged(const Layer& first) const {
         if (kind_ != Kind::Layered3) return first;
         Layer made{4 * LANES, first.out, std::vector<float>(4 * LANES * static_cast<std::size_t>(first.out)),
@@ -143,8 +143,8 @@ private:
     Kind kind_ = Kind::Raw;
     bool directional_ = false;
     int parameters_ = 0;
-    // For the four scalar parameters of `layered3`: 1 if the logarithm is taken, and then what to subtract, and the
-    // factor that leads to 0 .. 1.
+    // One lane for each of the four scalar parameters x of `layered3`. (y - start) per_range lies in 0 .. 1, with y =
+    // log(x) where `log_` is 1 and y = x where it is 0.
     Lanes<float> log_{0.0f}, start_{0.0f}, per_range_{0.0f};
 };
 

@@ -53,7 +53,7 @@ public:
     Json document() {
         Json value = this->value(0);
         space();
-        if (place_ != text_.size()) fail("text after its end");
+        if (place_ != text_.size()) fail("text follows its end");
         return value;
     }
 

@@ -102,9 +102,9 @@ struct Kernels {
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
     // `encode` fills in a row of inputs. `decode` makes a blend of a row of outputs `raw`, which it overwrites. `odds`
-    // then fills in the odds of the blend. `odds` is apart from `decode`, because its vectors are narrow: some CPUs
-    // have fewer units for their widest vectors, and run narrow vectors among wide ones at half the speed. Batches call
-    // `decode` for all queries first, then `odds`.
+    // then fills in the odds of the blend. `odds` is apart from `decode` because its vectors are narrow. Some CPUs
+    // have fewer units for their widest vectors, and run narrow vectors among wide ones at half the speed. So batches
+    // call `decode` for all queries first, and then `odds`.
     void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
     void (*decode)(const Preparation&, float* raw, float cosine, Blend<float>&);
     void (*odds)(const Preparation&, float cosine, Blend<float>&);

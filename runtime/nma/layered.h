@@ -2,7 +2,8 @@
 // conductor. Scalar twin of nma/sources/layered.py and nma/sources/layered_eval.py, which explain the method (Guo,
 // Hasan and Zhao 2018, "position-free").
 //
-// Directions are unit vectors in the local frame, z up. Values are f cos(theta_o) [1/sr] and noisy, densities per sr.
+// Directions are unit vectors in the local frame, z up. Values are f cos(theta_o) [1/sr], with noise. Densities are per
+// sr.
 #pragma once
 
 #include <cstdint>
@@ -38,13 +39,14 @@ private:
     std::uint64_t state_ = 0, increment_;
 };
 
-// The interfaces and the medium. The conductor's indices are relative to those of the coat above it.
+// The interfaces and the medium. `eta_bottom` and `k_bottom` are the conductor's index of refraction divided by the
+// coat's, per colour channel.
 struct Stack {
     float alpha_top, alpha_bottom, eta_top;
     Vec eta_bottom, k_bottom, albedo;
     float sigma_t;
 
-    // From a vector of the class `layered3`.
+    // The stack for a parameter vector of the class `layered3`.
     static Stack of(const float* p) {
         using namespace layered3;
         const auto colour = [p](int first) { return Vec{p[first], p[first + 1], p[first + 2]}; };
@@ -64,21 +66,24 @@ struct Walk {
 namespace detail {
 
 inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)); }
+// `w` moved slightly above the horizon, where visible normals are undefined.
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
+// How wide the event of a density is. `unscattered` weighs its connections by it.
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
+// The reflectance of the conductor, per colour channel.
 inline Vec conductor(float cosine, const Stack& stack) {
     const Vec &eta = stack.eta_bottom, &k = stack.k_bottom;
     return {fresnel_conductor<float>(cosine, eta.x, k.x), fresnel_conductor<float>(cosine, eta.y, k.y),
             fresnel_conductor<float>(cosine, eta.z, k.z)};
 }
 
-// Fraction that passes `depth` of the slab along `w` without meeting the medium.
+// The fraction of light along `w` that passes `depth` of the slab without meeting the medium. 1 is the whole slab.
 inline float transmittance(const Stack& stack, float depth, const Vec& w) {
     return stack.sigma_t > 0.0f ? exp(-stack.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
 }
 
-// Russian roulette on the brightest channel.
+// Russian roulette on the brightest channel. `exempt` walks always survive.
 inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     if (exempt) return;
     const float chance =
@@ -92,7 +97,8 @@ inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     walk.alive = chance > 0.0f;
 }
 
-// Advances a walk by one free flight through a medium of `sigma_t` and one event. Returns whether the walk left.
+// Advances a walk by one free flight through a medium of extinction `sigma_t`, and by the event at its end: a
+// scattering or a visit to an interface. Returns whether the walk left the material.
 inline bool step(const Stack& stack, float sigma_t, Walk& walk, Random& random) {
     const Vec d = walk.direction;
     if (walk.inside && sigma_t > 0.0f) {
@@ -138,7 +144,8 @@ inline bool step(const Stack& stack, float sigma_t, Walk& walk, Random& random) 
     return leaves;
 }
 
-// A walk from `w` just below the coat: all of it goes down.
+// A walk that has come from `w` and is now just below the coat. The walk always refracts, because the light that the
+// coat reflects has a closed form.
 inline Walk enter(const Stack& stack, const Vec& w, Random& random) {
     const float alpha = stack.alpha_top, u1 = random.uniform(), u2 = random.uniform();
     const Vec view = above(w), m = sample_visible_normal<float>(view, alpha, alpha, u1, u2);
@@ -148,16 +155,18 @@ inline Walk enter(const Stack& stack, const Vec& w, Random& random) {
     return {down, {weight, weight, weight}, 1.0f, true, weight > 0.0f};
 }
 
-// A segment of a walk that met interfaces only: its direction, and its throughput over the chance that it was kept.
+// A segment of a walk that met interfaces only: its direction, and its throughput divided by the probability that it
+// was chosen.
 struct Way {
     Vec direction, reached;
 };
 
-// One segment of a walk beyond its first, kept by weighted reservoir sampling (Chao 1982).
+// One segment of a walk after its first segment, chosen by weighted reservoir sampling (Chao 1982).
 struct Detour {
     Vec direction, tint{0.0f, 0.0f, 0.0f};
     float total = 0.0f;
 
+    // Chooses the current segment of `walk` instead, with a chance in proportion to its brightest channel.
     void offer(const Walk& walk, Random& random) {
         const float weight = walk.alive ? max_component(walk.throughput) : 0.0f;
         total += weight;
@@ -168,8 +177,8 @@ struct Detour {
     }
 };
 
-// Returns (q, t). q is the density of `up` when visible normals refract wo down [1/sr]; t is the density of wo given
-// `up`, over q.
+// Two densities of refraction at the coat, returned as (q, t). q [1/sr] is the density of `up` when wo is refracted
+// down at a visible normal. t is the density of wo given `up`, divided by q.
 inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& wo, const Vec& up) {
     const float alpha = stack.alpha_top, eta = stack.eta_top;
     const bool matched = eta == 1.0f;
@@ -183,18 +192,22 @@ inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& w
     return {matched ? 0.0f : visible_normal_pdf<float>(above(wo), m, alpha, alpha) * (eta * eta) * cos_up / length2, t};
 }
 
-// Density about a visit to the conductor [1/sr]. It is the same whichever way the visit is walked.
+// The approximate density [1/sr] of the conductor's reflection from `w_in` to `up`. It is the same in reverse.
 inline float sharpness(const Stack& stack, const Vec& w_in, const Vec& up) {
     return 0.25f * ggx_d<float>(normalize(w_in + up), stack.alpha_bottom, stack.alpha_bottom);
 }
 
-// Density of `out` when `w` is mirrored in a visible normal [1/sr].
+// The density [1/sr] of `out` when `w` is reflected at a visible normal.
 inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
     const Vec m = normalize(w + out);
     return visible_normal_pdf<float>(w, m, alpha, alpha) / (4.0f * maximum(dot(w, m), 1e-7f));
 }
 
-// Light from wi to wo that meets interfaces only. Sets `detour` to a segment of the walk `there` after its first.
+// Light from wi to wo that meets interfaces only. Sets `detour` to one segment of the walk `there` after its first.
+//
+// A path is sampled from both ends: `there` starts at wi, `back` at wo. All events are drawn except one, the
+// connection. There the two ends meet, and the density of the event is evaluated. `share` is the weight of one
+// connection among all that could make the same path: it is large where the event is blunt.
 inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
                        Random& random, bool forward, Way& detour) {
     const Vec drawn_up = -back.direction;
@@ -216,7 +229,7 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
         if (walk.height >= 1.0f) continue;
         const Vec w_in = -before.direction;
         const float rest = way_in + first;
-        // Leave the last visit to chance.
+        // Connect at the last visit to the conductor.
         float blunt = bluntness(sharpness(stack, w_in, drawn_up));
         float share = matched ? 1.0f : blunt / (blunt + rest + blunt_q);
         if (!forward && !(first > 0.0f)) share = 0.0f;
@@ -227,7 +240,7 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
                                  smith_g1<float>(drawn_up, stack.alpha_bottom, stack.alpha_bottom);
             total = total + before.throughput * conductor(cosine, stack) * weight;
         }
-        // Leave the way out to chance.
+        // Connect at the way out through the coat.
         blunt = bluntness(sharpness(stack, w_in, walk.direction));
         if (!matched) {
             const auto [q, t] = out_through_coat(stack, wo, walk.direction);
@@ -242,7 +255,7 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
     return total;
 }
 
-// Light that scatters in the medium. Each scattering counts as the last one: from there light takes the ways out.
+// Light that scatters in the medium. Every scattering of the walk is connected to each of the `ways` out.
 inline Vec scattered(const Stack& stack, Walk walk, const Way (&ways)[2], Random& random) {
     Vec total{0.0f, 0.0f, 0.0f};
     if (!(stack.sigma_t > 0.0f)) return total;
@@ -261,7 +274,7 @@ inline Vec scattered(const Stack& stack, Walk walk, const Way (&ways)[2], Random
     return total;
 }
 
-// The direction of light along `w` under a flat coat of index `eta`; it points up, too.
+// The direction `w` refracted into a flat coat of index `eta` (Snell's law), turned to point up.
 inline Vec refract_flat(const Vec& w, float eta) {
     const float x = w.x / eta, y = w.y / eta;
     return {x, y, sqrt(maximum(1.0f - x * x - y * y, 1e-7f))};
@@ -269,7 +282,7 @@ inline Vec refract_flat(const Vec& w, float eta) {
 
 }  // namespace detail
 
-// f cos(theta_o) of the coat's upper side alone [1/sr].
+// f cos(theta_o) [1/sr] of the reflection at the coat's upper side alone.
 inline float coat_reflection(const Stack& stack, const Vec& wi, const Vec& wo) {
     const Vec m = normalize(wi + wo);
     const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), stack.eta_top));
@@ -292,7 +305,8 @@ inline Vec evaluate(const Stack& stack, const Vec& wi, const Vec& wo, Random& ra
            coat_reflection(stack, wi, wo);
 }
 
-// One whole walk from `wi` (wi.z > 0). Its throughput is 0 if it was absorbed; else its direction is where it left.
+// One whole walk from `wi` (wi.z > 0). If the walk was absorbed, its throughput is 0. Otherwise its direction is the
+// one in which it left.
 inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     Walk made{-wi, {1.0f, 1.0f, 1.0f}, 1.0f, false, true};
     bool left = false;
@@ -301,7 +315,9 @@ inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     return made;
 }
 
-// What `pdf` needs to know of one wi: the weights of its lobes, and the width of the second.
+// The part of `pdf` that depends on wi only. The weights of the three lobes sum to 1: the coat's reflection, the
+// conductor's reflection seen through the coat, and a cosine lobe. `width` belongs to the second lobe, and `inside` is
+// wi refracted into the coat.
 struct Density {
     float coat, bottom, diffuse, width;
     Vec inside;
@@ -324,8 +340,8 @@ struct Density {
     }
 };
 
-// A density of wo [1/sr] that is close to the walk's, for weighing estimators. Its integral is at most 1, and it is
-// positive for wo.z > 0.
+// A density of wo [1/sr] similar to that of the walk, for importance sampling and for weighing estimators. Its integral
+// is at most 1, and it is positive for wo.z > 0.
 inline float pdf(const Stack& stack, const Density& density, const Vec& wi, const Vec& wo) {
     if (!(wo.z > 0.0f)) return 0.0f;
     const Vec inside_o = detail::refract_flat(wo, stack.eta_top);
@@ -335,15 +351,15 @@ inline float pdf(const Stack& stack, const Density& density, const Vec& wi, cons
     return mirrored + seen + density.diffuse * INV_PI<float> * wo.z;
 }
 
-// A direction with its density [1/sr]; a density of 0 marks an invalid one.
+// A direction with its density [1/sr]. A density of 0 marks an invalid direction.
 struct Drawn {
     Vec wo;
     float pdf;
 };
 
-// Draws a direction from `pdf` itself with three uniform numbers in [0, 1). Its weight is `evaluate` over the density,
-// which varies more than a walk's throughput. But a renderer that recombines samples of several materials needs their
-// exact densities, and that of a walk is not known.
+// Draws a direction with density `pdf` from three uniform numbers in [0, 1). The weight of the sample is `evaluate`
+// divided by the density, which varies more than the throughput of a walk. But a renderer that recombines samples of
+// several materials needs their exact densities, and a walk has no known density.
 inline Drawn sample(const Stack& stack, const Density& density, const Vec& wi, float u_lobe, float u1, float u2) {
     Vec wo;
     if (u_lobe < density.coat) {

@@ -9,7 +9,7 @@
 
 namespace nma {
 
-// Only points to arrays, which an `Adapter` owns.
+// Its pointers are to arrays that an `Adapter` owns.
 struct Preparation {
     Encoding encoding;
     NetworkView network;
@@ -17,15 +17,15 @@ struct Preparation {
     int instances, outputs;  // counts
     bool bounded;            // whether the blend may reflect no more light than it receives
     // For each lane of each field of each pack, in the order of `Pack` in memory: the index of its number among the
-    // decoded outputs. A lane without a number has the index of an output of padding, which is 0.
+    // decoded outputs. A lane without a number has the index of an output of padding, whose value is 0.
     const int* lanes;
 };
 
 // Picks the numbers of four lanes from memory, by four indices. LANES is 4 in this file, for every instruction set: it
-// is `nma::LANES`, the lanes of `Lanes` and `Pack`. In kernels/ the lanes of a vector hide that name.
+// is `nma::LANES`, the count of lanes of `Lanes` and `Pack`. In kernels/, LANES is the count of lanes of a vector.
 //
-// Its twin `Few` (kernels/avx512.h) picks from registers and holds `MOST` numbers. The other
-// instruction sets have no such registers. There `Few` is another name of `Indexed`.
+// `Few` (kernels/avx512.h) is its twin for at most `MOST` numbers, which it picks from registers. The other instruction
+// sets have no such registers. There, `Few` is another name of `Indexed`.
 struct Indexed {
     static constexpr int MOST = 0;
     const float* numbers;

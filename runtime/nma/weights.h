@@ -237,7 +237,7 @@ inline std::vector<float> material(const Json& about, const Weights& made) {
         if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30)
             found.push_back(static_cast<float>(item.number));
     if (found.size() != size || fitted->items.size() != size)
-        throw Error("its material is none of class " + made.class_name + "; fit it again");
+        throw Error("its material does not fit the class " + made.class_name + "; fit it again");
     return found;
 }
 

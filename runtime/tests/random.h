@@ -21,7 +21,7 @@ private:
     std::mt19937 engine_;
 };
 
-// Draws each number from its range. The logarithm of a logarithmic parameter is uniform, any other number is uniform.
+// Draws each number from its range: uniformly, or with a uniform logarithm if the parameter is logarithmic.
 inline void draw_parameters(const std::vector<SourceParam>& parameters, Random& random, float* to) {
     for (const SourceParam& p : parameters)
         for (int c = 0; c < p.size; ++c) {

@@ -65,8 +65,8 @@ struct Few {
 
 #include "body.inl"
 
-// The kernels below see a vector as four blocks of four lanes. `repeat` copies four numbers into all blocks: the four
-// at `p`, or block B of `v`.
+// The kernels below see a vector as four blocks of four lanes each. `repeat` copies four numbers into all blocks: the
+// four at `p`, or block B of `v`.
 NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_loadu_ps(p)); }
 template <int B>
 NMA_OP Vec repeat(Vec v) {

@@ -24,7 +24,7 @@ constexpr int NARROW = 32;
 //
 //     columns  [in][width]      floats. Column i holds what input i adds to each neuron.
 //     pairs    [in / 2][width]  two weights as bfloat16 in 32 bits: input 2 i in the low half, input 2 i + 1 in the
-//                               high half. A query reads half the memory, and reading it takes most of its time.
+//                               high half. This halves the memory, which a single query waits for.
 //     turned   [in][width]      the floats of `columns` in another order. Narrow networks on AVX-512 have it in
 //                               addition to `columns`, for single queries.
 //
@@ -40,9 +40,9 @@ constexpr int NARROW = 32;
 //     column 3, times x3     3>0  3>1  3>2  3>3         r = 3, times x0..x3    0>3  1>0  2>1  3>2    3
 //
 // Lane k of sum r belongs to neuron (k + r) % 4. So sum r is turned once, r lanes to the right, after all inputs were
-// added. The four turned sums add up to the neurons. A layer has many such squares of 4 x 4 weights: square (b, g) goes
-// from the inputs 4 b .. 4 b + 3 to the neurons 4 g .. 4 g + 3. Row r of square (b, g) lies in column 4 b + r, at the
-// places 4 g .. 4 g + 3. The columns of the first WIDTH_STEP neurons come first, then those of the next WIDTH_STEP.
+// added. The four turned sums, added up, are the neurons. A layer has many such squares of 4 x 4 weights: square (b, g)
+// goes from the inputs 4 b .. 4 b + 3 to the neurons 4 g .. 4 g + 3. Row r of square (b, g) lies in column 4 b + r, at
+// the places 4 g .. 4 g + 3. The columns of the first WIDTH_STEP neurons come first, then those of the next WIDTH_STEP.
 struct LayerView {
     int in, width;
     const float* bias;
