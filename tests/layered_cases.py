@@ -59,8 +59,10 @@ def table_of(sums, squares, per_row):
 
 
 def z_scores(found, error, walks, factor=1.0, known=np.inf):
-    """The z-scores of `found` (times `factor`) minus walks, for sums of rows and for the bins with over 100 walks whose
-    relative error is below `known`."""
+    """Returns the z-scores of `factor` times `found` minus the table `walks`.
+
+    Each row has a score, and so has each bin with over 100 walks and with a relative error below `known`.
+    """
     enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
     enough &= error < known * found
     difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2

@@ -17,7 +17,7 @@ APP = typer.main.get_command(cli.app)
 COMMANDS = tuple(APP.commands)
 
 
-# These packages take long to import. Only the work of a command needs them.
+# Packages that take long to import, and that only the work of a command needs.
 HEAVY = ("numpy", "mitsuba", "drjit", "jax", "zarr", "PIL", "matplotlib")
 
 

@@ -31,5 +31,5 @@ def test_simulate_and_evaluate_print_one_json_object_and_nothing_else(nma, untra
 
 
 def test_json_has_no_infinity():
-    """JSON has null in place of infinity, which is the PSNR of two equal tables."""
+    """The PSNR of two equal tables is infinite, which JSON output writes as null."""
     assert _finite({"psnr": float("inf"), "ae": 0.0}) == {"psnr": None, "ae": 0.0}

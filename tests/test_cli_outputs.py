@@ -1,4 +1,4 @@
-"""Commands check their outputs before they begin. If an output cannot be written, they fail with one line."""
+"""Commands check their outputs before they begin. If an output cannot be written, a command fails with one line."""
 
 import errno
 import sys

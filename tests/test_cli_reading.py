@@ -1,4 +1,4 @@
-"""The option `--set` of commands: its text becomes a change of a material."""
+"""The option `--set` of commands changes the parameters of a material."""
 
 import numpy as np
 import pytest

@@ -52,9 +52,9 @@ def test_a_damaged_part_is_simulated_again(nma, tmp_path):
 
 
 def test_a_run_survives_if_another_run_removes_its_parts(nma, tmp_path, monkeypatch):
-    """Two runs write the same output. One ends and removes the folder of parts just before the other renames a part.
+    """Two runs write one output. The first ends and removes the folder of parts, just before the second renames a part.
 
-    A failure means that the other run stops with an error.
+    A failure means that the second run stops with an error.
     """
     replace, taken = Path.replace, []
 

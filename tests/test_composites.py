@@ -77,8 +77,8 @@ def normalmap(bsdf):
     return {"type": "normalmap", "normalmap": bitmap_texture(up), "a": bsdf}
 
 
-# For each composite: how to make it from a BSDF, and the weights of three pictures in its picture. They are the
-# pictures of the BSDF, of the diffuse BSDF, and of the bare sky.
+# For each composite: how to make it from a BSDF, and the weights of three pictures in its picture. These pictures show
+# the BSDF, the diffuse BSDF, and the bare sky.
 COMPOSITES = {
     "blendbsdf": (blend, (1 - WEIGHT, WEIGHT, 0.0)),
     "mask": (mask, (OPACITY, 0.0, 1 - OPACITY)),

@@ -62,7 +62,7 @@ def picture(loaded, spp=16, seed=0):
 
 @pytest.fixture
 def compiled():
-    """A function that runs its argument and returns how many kernels that compiled."""
+    """A function that runs its argument and returns the count of kernels that were compiled meanwhile."""
 
     def count(function):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -118,7 +118,7 @@ def test_materials_of_one_structure_share_a_kernel(adapter, compiled, kind):
 
 
 def test_loading_many_materials_leaves_memory_flat():
-    """200 materials take less than 10 MB, although their adapter has 19,000 weights. So they share the weights."""
+    """200 materials with an adapter of 19,000 weights take less than 10 MB, because they share the weights."""
     memory = lambda: int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")  # noqa: E731
     make = lambda: mi.load_dict({"type": "nma", "material": "gold-red-lacquer"})  # noqa: E731
     kept = [make() for _ in range(3)]
@@ -157,7 +157,7 @@ def test_frozen_functions_render_edited_values(adapter, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ("plain", "textured"))
 def test_frozen_functions_see_derivatives_of_numbers_set_before(adapter, kind):
-    """Derivatives by an input that was set before the call are the same in a frozen function, within 2 %.
+    """A frozen function computes the same derivatives, within 2 %, by an input that was set before the call.
 
     The curves of a plain material are computed before the call, so that the frozen function receives both the input and
     the curves.
@@ -259,7 +259,7 @@ def test_of_several_edits_only_the_wrong_ones_are_undone(adapter, kind):
 def test_values_that_frozen_functions_set_are_clamped(adapter):
     """A value beyond its bounds that a frozen function sets renders as the nearest allowed value.
 
-    That holds inside the frozen function, and for later renderings outside of it.
+    Later renderings outside of the frozen function also show the clamped value.
     """
     loaded = scene(adapter | {"clamp": False})
     params = mi.traverse(loaded)
@@ -278,7 +278,7 @@ def test_values_that_frozen_functions_set_are_clamped(adapter):
 
 
 def shared_key(params, leaf):
-    """Returns the key of the shared texture in `params`. Mitsuba names it by the first object that uses it."""
+    """Returns the key of the shared texture in `params`. The key begins with the first object that uses the texture."""
     (key,) = (key for key in params.keys() if key.endswith(f".{leaf}") and "sky" not in key)  # noqa: SIM118
     return key
 

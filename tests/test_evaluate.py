@@ -79,7 +79,7 @@ def fine_means(adapter, bins, points=1 << 11, repeats=6):
 
 
 def near_mirror():
-    """Returns the bins (n, 3) around the mirror direction, in every third row. Narrow lobes lie there."""
+    """Returns the bins (n, 3) around the mirror direction, where narrow lobes lie, in every third row."""
     return np.array(
         [
             (i, o, p)
@@ -205,7 +205,7 @@ def test_references_that_cannot_be_compared_are_refused():
 def test_materials_beyond_the_training_range_are_refused_or_clamped():
     """An evaluation refuses a parameter beyond the training range, or clamps it on request.
 
-    It never judges an adapter by its extrapolation without a word.
+    Otherwise the figures would judge how the network extrapolates.
     """
     layers = [
         (
@@ -259,7 +259,7 @@ def test_figures_are_their_formulas():
 
 @pytest.mark.parametrize("scale", (1e-4, 0.01, 0.3, 2.0))
 def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
-    """The noise floor equals a Monte Carlo estimate of this loss, from low noise to noise larger than the values."""
+    """The noise floor equals a Monte Carlo estimate of that loss, for noise much smaller to larger than the values."""
     rng = np.random.default_rng(4)
     b = rng.exponential(0.3, (500,))
     error = scale * rng.uniform(0.0, 1.0, 500)
@@ -272,7 +272,7 @@ def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
 def test_counting_errors_are_exact_for_walks_of_throughput_1():
     """The stated error is the standard deviation of tables whose walks all have throughput 1, within 5 %.
 
-    The count of walks in a bin is then binomial, and eq. 9 divides it.
+    The count of walks in such a bin is binomial, and eq. 9 converts the count to a value.
     """
     rows, walks, omega = 4, 4_000_000, 2.0 * math.pi / 100
     chance = np.array([0.001, 0.01, 0.05])

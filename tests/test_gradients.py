@@ -84,7 +84,7 @@ def replaced(params, key, value):
 def slopes(loaded, directions, step, spp, seeds):
     """Returns derivatives of the mean of a picture along each direction, by `prb` and by central differences.
 
-    Both are dictionaries of arrays (seeds,), by the keys of `directions`.
+    Both results are dictionaries of arrays (seeds,), by the keys of `directions`.
     """
     params = mi.traverse(loaded)
     start = {key: np.array(params[key], np.float64).reshape(d.shape) for key, d in directions.items()}
@@ -93,7 +93,7 @@ def slopes(loaded, directions, step, spp, seeds):
         for key, value in start.items():
             replaced(params, key, value)
         params.update()
-        # The pass for derivatives has a seed of its own. It gets the seed of the pictures below.
+        # `seed_grad` is the seed of the pass for derivatives. The pictures below use the same seed.
         picture = mi.render(loaded, params, spp=spp, seed=seeds + seed, seed_grad=seed)
         dr.backward(dr.mean(picture, axis=None))
         for key, d in directions.items():
@@ -126,7 +126,7 @@ def case(name, folder):
 def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
     """Derivatives equal finite differences within 1 %, for direct light from one point light.
 
-    The only random numbers are the positions in the pixels, which are the same for both. So there is no other noise.
+    The only random numbers are positions in the pixels, which derivatives and differences share.
     """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}
@@ -141,7 +141,7 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
 def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
     """Derivatives equal finite differences within four standard errors over 8 seeds, with indirect light.
 
-    Sampling makes both noisy. The false-alarm rate is .007 in all (Student's t); seeds are fixed.
+    Sampling makes derivatives and differences noisy. The false-alarm rate is .007 in all, by Student's t.
     """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}

@@ -48,7 +48,8 @@ def tables():
 def test_bin_means_in_jax_equal_the_tables_of_the_evaluation(tables, law, kind):
     """Training in JAX and evaluation in Dr.Jit average the same target to the same means over bins.
 
-    Each has code and points of its own. A failure means that training fits other values than the evaluation judges.
+    The two use different code and different points. A failure means that training fits other values than the
+    evaluation judges.
     """
     params, stretched = target.TARGETS[kind], kind == "stretched"
     across = BRASS.instances[0]._replace(anisotropic=-3.0 if stretched else 0.0)
@@ -96,7 +97,7 @@ def compound_poisson(rng, mean, quantum, shape):
 def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at_their_median():
     """The brightness that minimises the log loss is the median of sparse bins, which is too dark.
 
-    The bias of the Huber loss is less than 30 % of that. The target is matte, and only its brightness is fitted.
+    The Huber loss has less than 30 % of this bias. The target is matte, and only its brightness is fitted.
     """
     rng, quantum = np.random.default_rng(6), 0.2
     base = replace(

@@ -122,7 +122,7 @@ def test_an_anisotropic_fit_learns_azimuths(tmp_path):
     ],
 )
 def test_tables_are_fitted_bin_by_bin(grid):
-    """A fit to a table of any resolution has less than 30 % of the log loss of a Lambertian. It needs no parameters."""
+    """A fit to a table of any resolution has less than 30 % of the log loss of a Lambertian BRDF."""
     source = from_dict({**BRUSHED, "alpha_u": 0.4} if not grid.phi_i else BRUSHED)
     tables = tabulate_values(source, grid=grid)
     changes = {"network": "1x32", "rows": 64, "points": 4, "steps": 300, "albedo": 0.0, "finest": 0.01}

@@ -17,7 +17,7 @@ from nma.ops import Vec3, at_azimuth_0
 from nma.params import MEASURED
 
 CASES = 4000
-# The count of numbers per instance: its fields, and two more for the colour.
+# The count of numbers per instance. Its colour is one field of three numbers.
 FIELDS = len(target.Principled._fields) + 2
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -55,7 +55,7 @@ def cases(seed=0, count=2):
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 1e-4)])
 def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, bounded):
     blend, wi, wo = cases()
-    # Both compute from the same inputs, rounded to the precision of the runtime.
+    # The runtime and the package get the same inputs, rounded to the precision of the runtime.
     numbers, i, o = (x.astype(dtype) for x in (flat(blend), rows(wi), rows(wo)))
     found = np.zeros((CASES, 4), dtype)
     call = bridge.evaluate_float if dtype == np.float32 else bridge.evaluate_double
@@ -160,7 +160,7 @@ def test_an_adapter_evaluates_like_the_package():
 def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hidden):
     """The values of a measured material agree within 2e-3.
 
-    Its network has one input and no parameters. Its lobes are stretched in the plane of incidence, flattened and faded.
+    The network has one input and no parameters. Lobes are stretched in the plane of incidence, flattened and faded.
     """
     rng, size = np.random.default_rng(14), target.output_size(2, target.MEASURED_PARAMS)
     layers = network.init(rng, [1, *hidden, size], rng.normal(size=size))
@@ -180,7 +180,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
 def test_curves_have_the_values_of_the_network():
     """Values from curves agree with values from the network: the median error is below 5e-4 of a value.
 
-    That is about the error that nma/render/curves.py states for as many nodes, 1e-4.
+    nma/render/curves.py states an error of about 1e-4 for this count of nodes.
     """
     params, cosines = queries(8)
     wi = facing(cosines)

@@ -52,7 +52,7 @@ def none():
 
 
 def close(a, b, instruction_set):
-    """Returns the share of rows that agree. avx512_bf16 rounds activations to bfloat16, so it is allowed more error."""
+    """Returns the share of rows that agree. The set avx512_bf16, which rounds activations, may be less exact."""
     rounded = instruction_set == "avx512_bf16"
     return np.isclose(a, b, rtol=0.1 if rounded else 2e-3, atol=2e-2 if rounded else 1e-4).all(axis=1).mean()
 

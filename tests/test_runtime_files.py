@@ -121,7 +121,7 @@ def test_inconsistent_files_are_refused(tmp_path, data, message):
 
 @pytest.mark.usefixtures("compiler")
 def test_a_folder_is_no_weights_file(tmp_path):
-    """A folder is refused with an `nma::Error`. It can be opened like a file, and only reading it fails."""
+    """A folder is refused with an `nma::Error`, although it can be opened like a file and only reading it fails."""
     with pytest.raises(
         WeightsError, match=re.escape(f"{tmp_path}: no such weights file, or it cannot be read")
     ):

@@ -1,4 +1,4 @@
-"""The simulated material in C++: its density, its samples, its walk and its estimate are the package's."""
+"""The simulated material in C++ equals that of the package: its density, samples, walk, estimate and albedo."""
 
 import ctypes
 from functools import cache
@@ -40,7 +40,7 @@ def view(mu):
 
 @pytest.fixture(scope="module")
 def bridge(compiler, tmp_path_factory):
-    # Dr.Jit does not fuse products and sums. This flag keeps the compiler from it, so that both round in the same way.
+    # Dr.Jit does not fuse products and sums. With this flag the compiler does not either, and both round equally.
     library = built(compiler, "layered_bridge.cpp", tmp_path_factory.mktemp("layered"), "-ffp-contract=off")
 
     def call(name, inputs, shape):
@@ -169,7 +169,7 @@ def bent_more(params):
 def test_every_bin_is_that_of_the_package(bridge, case, estimator):
     """Walks and estimates in C++ have the same means as walks of the package, in bins and in sums of bins.
 
-    These are Z-tests. The false-alarm rate is `FALSE_ALARM` per case; seeds are fixed.
+    The Z-tests have the false-alarm rate `FALSE_ALARM` per case; seeds are fixed.
     """
     z = scores(bridge, estimator, hard(case), reference(case))
     assert z.size > 0.1 * GRID.bins
@@ -243,7 +243,7 @@ def test_weights_of_samples_have_the_mean_of_walks(bridge, case):
 def test_albedos_have_no_noise_and_are_close_to_those_of_many_walks(bridge):
     """An albedo is the mean of a fixed set of 256 walks, so that it has no noise between calls.
 
-    It is within .1 of the mean of many walks. The standard deviation of 256 walks is at most .5 / 16.
+    The albedo is within .1 of the mean of many walks. The standard deviation of 256 walks is at most .5 / 16.
     """
     for values in (*CASES.values(), NARROW):
         for mu in COSINES:

@@ -26,7 +26,7 @@ def weights(tmp_path_factory):
 
 
 def tool(name):
-    """Returns the path of a program, or skips the test if it is missing. `tools/setup.sh test` installs all."""
+    """Returns the path of a program, or skips the test without it. `tools/setup.sh test` installs all programs."""
     found = shutil.which(name)
     if found is None:
         pytest.skip(f"there is no {name} here")
@@ -62,7 +62,7 @@ def test_the_example_of_the_simulated_material_agrees_with_itself(tmp_path):
     """The four estimates of the same light in the example agree within 4.5 standard errors.
 
     A false alarm happens in about one of ten thousand runs. The estimate that combines both samplings has a smaller
-    error than each of them.
+    error than either sampling alone.
     """
     lines = output(built("g++", "example_layered.cpp", tmp_path, "-O2")).splitlines()[1:]
     means, errors = np.array([[float(x) for x in line.split()[-3::2]] for line in lines]).T
@@ -102,7 +102,7 @@ int main(int, char** words) {
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_fast_math_refuses_numbers_that_are_not_finite(compiler, tmp_path):
-    """NaN and infinity are refused even with -ffast-math, with which compilers remove `std::isfinite`."""
+    """NaN and infinity are refused even with -ffast-math, although compilers then remove `std::isfinite`."""
     source, program, path = (tmp_path / name for name in ("finite.cpp", "finite", "bad.safetensors"))
     source.write_text(FINITE)
     subprocess.run([tool(compiler), *STRICT, "-O1", "-ffast-math", source, "-o", program], check=True)

@@ -116,7 +116,7 @@ def draw_lobes(cases, count, seed):
         for k, (alpha_x, alpha_y, alpha_c) in enumerate(target.lobe_alphas(blend)):
             wo = ops.select(lane % 11 == 2 * k + 1, sample_spec(wi, alpha_x, alpha_y, u[1], u[2]), wo)
             wo = ops.select(lane % 11 == 2 * k + 2, sample_clearcoat(wi, alpha_c, u[1], u[2]), wo)
-        # Samples below the horizon are useless for placing bins. Uniform directions replace them.
+        # Uniform directions replace samples below the horizon, which are useless for placing bins.
         z = u[1]
         r = dr.sqrt(1.0 - z * z)
         uniform = Vec3(r * dr.cos(dr.two_pi * u[2]), r * dr.sin(dr.two_pi * u[2]), z)
@@ -126,7 +126,7 @@ def draw_lobes(cases, count, seed):
 
 
 def adaptive_bins(boxes, a, b):
-    """Cuts `boxes` (n, 1, 4) into boxes with equal counts. Returns boxes (n, 2^FINE, 4) and the cuts per level."""
+    """Cuts `boxes` (n, 1, 4) at medians of the samples. Returns boxes (n, 2^FINE, 4) and the cuts per level."""
     n = len(boxes)
     points = np.stack([a.numpy(), b.numpy()], -1).reshape(n, 1, -1, 2)
     cuts = []
