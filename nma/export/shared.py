@@ -33,7 +33,7 @@ def shared() -> str:
     parts = [_HEAD, _values(_GENERAL)]
     parts.append("// Constants of the layered source.")
     parts.append(_namespace("layered", _values(_LAYERED)))
-    parts.append("// The first column of each parameter in the vector of its class (nma/params.py).")
+    parts.append("// The index of each parameter's first number in the vector of its class (nma/params.py).")
     parts += [_namespace(name, _columns(SPACES[name])) for name in sources.names()]
     parts.append("}  // namespace nma")
     return "\n".join(parts) + "\n"
