@@ -1,9 +1,9 @@
-"""Directional albedos of the lobes of a Principled BRDF, as upper bounds: they are the odds of sampling a lobe, and
-keep a blend from reflecting more light than it receives.
+"""Upper bounds of the directional albedo of each lobe of a Principled BRDF. They have two uses: a lobe is sampled with
+a probability in proportion to its bound, and `bounded` keeps a blend from reflecting more light than it receives.
 
-The Principled BRDF does not conserve energy: a bright diffuse base does not know of the reflection above it, its
+The Principled BRDF does not conserve energy. Its diffuse base is not reduced by the reflection above it, the base's
 retro-reflection alone reaches 1.5 at grazing angles, and `spec_tint` may multiply a reflectance of .13 by 13.
-Checked by quadrature over the parameters' ranges (tests/test_target_albedo.py).
+tests/test_target_albedo.py checks the bounds by quadrature over the ranges of the parameters.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from nma.target.principled import (
     spec_fresnel,
 )
 
-# Keep the densities of the broad and the coloured lobe positive where they reflect nothing.
+# Added to the bounds of the diffuse and the specular lobe, so that they are sampled even where they reflect nothing.
 MIN_ALBEDO = 1e-4
-# By how much the fitted parts of the bounds fall short, at worst.
+# The fitted parts of the bounds are too low by at most these amounts, which are added.
 SPEC_MARGIN = 0.009
 CLEARCOAT_MARGIN = 0.005
 SHEEN_MARGIN = 0.0005
-# Means of the Schlick weight of wo times the powers 0, 1 and 2 of cos(theta_o), over the cosine-weighted hemisphere.
+# Cosine-weighted means, over the hemisphere of wo, of its Schlick weight times cos(theta_o) to the powers 0, 1 and 2.
 _W0, _W1, _W2 = 1.0 / 21.0, 1.0 / 84.0, 1.0 / 252.0
 
 
 class Albedos(NamedTuple):
-    """What each lobe of an instance reflects of uniform light, at most."""
+    """Upper bounds of the directional albedo of each lobe of an instance."""
 
     diffuse: Color
     spec: Color
@@ -41,7 +41,7 @@ class Albedos(NamedTuple):
 
 
 def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
-    """Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0, and nothing fades."""
+    """The bounds at cos(theta_i) > 0. They ignore `flatness` and `fade`."""
     weight = schlick_weight(cos_theta_i)
     # Names for the parts would cost the C++ runtime copies: 2.5 ns of a query.
     return Albedos(
@@ -52,11 +52,11 @@ def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
 
 
 def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:
-    """The diffuse lobe with its retro-reflection, integrated in closed form, and the sheen, fitted."""
+    """The bound of the diffuse lobe: base and retro-reflection integrated in closed form, plus a fit to the sheen."""
     r = p.roughness
     lambert = (1.0 - 0.5 * weight) * (1.0 - 0.5 * _W0)
-    # The retro-reflection of `diffuse_terms` is r (1 + wi . wo); means over wo of it, of it times the weight of wo,
-    # and of its square times that weight.
+    # The factor `retro` of `diffuse_terms` is r (1 + wi . wo). Below are cosine-weighted means over wo: of this factor,
+    # of the factor times the Schlick weight of wo, and of its square times that weight.
     retro = r * (1.0 + (2.0 / 3.0) * cos)
     retro_w = r * (_W0 + cos * _W1)
     sin2 = 1.0 - cos * cos
@@ -69,12 +69,12 @@ def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:
 
 
 def spec_albedo(p: Principled, cos: Float) -> Color:
-    """The specular lobe, single scattering: masking at most 1, and Fresnel at the cosine of a typical facet.
+    """The bound of the specular lobe (single scattering): a bound of the masking times Fresnel at a typical facet.
 
-    Rough surfaces at grazing angles show facets that are tilted towards the viewer.
+    At grazing angles the visible facets of rough surfaces are tilted towards the viewer.
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    alpha = ops.minimum(alpha_x, alpha_y)  # the direction in which facets tilt least
+    alpha = ops.minimum(alpha_x, alpha_y)  # along this axis facets tilt least
     tilt = 0.62 * alpha / (alpha + 0.35)
     facet2 = ops.minimum(cos * cos + tilt * tilt, 1.0)
     facet = ops.sqrt(facet2)
@@ -84,8 +84,11 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
 
 
 def clearcoat_albedo(p: Principled, cos: Float, weight: Float) -> Float:
-    """The clearcoat as if it were a mirror; it fades at grazing for lack of 1 / (4 cos_i cos_o)."""
-    # `masking_denominator` without the root that is sin(theta_i).
+    """The bound of the clearcoat, treated as a mirror.
+
+    It goes to 0 at grazing angles, because the clearcoat's formula has no factor 1 / (4 cos_i cos_o).
+    """
+    # As `masking_denominator`, with sin^2(theta_i) computed from the cosine.
     cos2 = cos * cos
     alpha2 = CLEARCOAT_MASKING_ALPHA * CLEARCOAT_MASKING_ALPHA
     masking = 2.0 * cos / (cos + ops.sqrt(cos2 + alpha2 * (1.0 - cos2)))

@@ -1,4 +1,4 @@
-"""Blend of Principled BRDFs, the target of every adapter: one evaluation, one density and one sample over all lobes."""
+"""A blend of Principled BRDFs, the target of every adapter: value, density and sampling over all lobes together."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from nma.target.sampling import sample_clearcoat, sample_diffuse, sample_spec
 
 
 class Blend(NamedTuple):
-    """Instances and their weights, which sum to one; with two, the first weight is the paper's `blend` (eq. 3).
+    """Instances of the Principled BRDF, and their weights, which sum to one.
 
-    `scale` dims the whole: `bounded` sets it.
+    With two instances, the first weight is the paper's `blend` (eq. 3). `scale` dims the whole blend; `bounded` sets
+    it.
     """
 
     instances: tuple[Principled, ...]
@@ -30,7 +31,7 @@ class Blend(NamedTuple):
 
 
 class Odds(NamedTuple):
-    """Chance of each lobe of an instance."""
+    """The probability of sampling each lobe of an instance."""
 
     diffuse: Float
     spec: Float
@@ -38,10 +39,10 @@ class Odds(NamedTuple):
 
 
 def bounded(blend: Blend, cos_theta_i: Float) -> Blend:
-    """The blend, dimmed where its albedo at cos(theta_i) might exceed 1: each channel by the bound of its albedo.
+    """The blend, dimmed where its albedo at cos(theta_i) might exceed 1: each channel is divided by its albedo's bound.
 
-    Where every bound is below 1 nothing changes. Parameters that follow the direction are free to be dimmed by it, too;
-    a blend of constant ones would lose its reciprocity.
+    Channels whose bound is below 1 do not change. Use it only for parameters that depend on the direction: a blend of
+    constant parameters would lose its reciprocity.
     """
     total = Color(0.0, 0.0, 0.0)
     for p, weight in zip(blend.instances, blend.weights, strict=True):
@@ -51,7 +52,7 @@ def bounded(blend: Blend, cos_theta_i: Float) -> Blend:
 
 
 def eval_pdf(blend: Blend, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
-    """f cos(theta_o) [1/sr] and the density of `sample` [1/sr], both zero below the horizon. Unit directions."""
+    """f cos(theta_o) [1/sr] and the density of `sample` [1/sr], zero below the horizon. Directions are unit vectors."""
     g = geometry(wi, wo)
     value = Color(0.0, 0.0, 0.0)
     pdf: Float = 0.0
@@ -78,12 +79,12 @@ def eval(blend: Blend, wi: Vec3, wo: Vec3) -> Color:
 
 
 def pdf(blend: Blend, wi: Vec3, wo: Vec3) -> Float:
-    """Density of `sample` per solid angle of `wo` [1/sr]."""
+    """The density of `sample` per solid angle of `wo` [1/sr]."""
     return eval_pdf(blend, wi, wo)[1]
 
 
 def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
-    """Direction `wo` from three uniform numbers in [0, 1), with `eval_pdf` of it; pdf == 0 marks an invalid sample."""
+    """A direction `wo` from three uniform numbers in [0, 1), its value, and its density (0 for an invalid sample)."""
     view = Vec3(wi.x, wi.y, ops.select(wi.z > MIN_COS, wi.z, 1.0))
     odds = lobe_probabilities(blend, view.z)
     # All diffuse lobes come first, then all specular ones, then the clearcoats.
@@ -92,7 +93,7 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
     (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)
     spec_end = spec_start
     clearcoat_end = clearcoat_start
-    # The widths of an instance hold from where the lobes of the instances before it end.
+    # Select the widths of the instance whose interval of `u_lobe` is hit: its interval follows the previous instance's.
     for o, (next_x, next_y, next_c) in zip(odds, others, strict=False):
         spec_end = spec_end + o.spec
         clearcoat_end = clearcoat_end + o.clearcoat
@@ -110,7 +111,7 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
 
 
 def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[Odds, ...]:
-    """Chance of each lobe of each instance, in proportion to its share of the blend's albedo; they sum to one."""
+    """The probability of each lobe of each instance, in proportion to its bound of albedo; all of them sum to one."""
     albedos = [lobe_albedos(p, cos_theta_i) for p in blend.instances]
     means = [Odds(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat) for a in albedos]
     total = sum(w * (m.diffuse + m.spec + m.clearcoat) for w, m in zip(blend.weights, means, strict=True))
@@ -119,7 +120,7 @@ def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[Odds, ...]:
 
 
 def lobe_alphas(blend: Blend) -> tuple[tuple[Float, Float, Float], ...]:
-    """For each instance the widths of the specular lobe along x and y and of the clearcoat: where narrow peaks are."""
+    """For each instance: the widths of the specular lobe along x and along y, and the width of the clearcoat."""
     return tuple(
         (*spec_alpha(p.roughness, p.anisotropic), clearcoat_alpha(p.clearcoat_gloss)) for p in blend.instances
     )

@@ -1,4 +1,4 @@
-"""The analytic BRDF for a view direction: a blend in the frame that it holds in. `Adapter.prepare` returns it."""
+"""The analytic BRDF for a view direction: a blend and its frame. `Adapter.prepare` returns it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from nma.target.plane import Plane
 class Brdf(NamedTuple):
     """A blend and its frame, prepared once for a view direction `wi` per lane, then evaluated and sampled.
 
-    `plane` is the plane of incidence if lobes stretch along it. It is None if the blend holds in the local frame.
-    All directions are unit vectors of the local frame; `wi` is the one that the BRDF was prepared for.
+    If lobes stretch along the plane of incidence, `plane` is that plane. Otherwise `plane` is None: the blend's frame
+    is the local frame. Directions are unit vectors of the local frame. Pass the `wi` for which the BRDF was prepared.
     """
 
     blend: Blend
@@ -25,15 +25,15 @@ class Brdf(NamedTuple):
         return lobes.eval(self.blend, self._enter(wi), self._enter(wo))
 
     def pdf(self, wi: Vec3, wo: Vec3) -> Float:
-        """Density of `sample` per solid angle of `wo` [1/sr]."""
+        """The density of `sample` per solid angle of `wo` [1/sr]."""
         return lobes.pdf(self.blend, self._enter(wi), self._enter(wo))
 
     def eval_pdf(self, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
-        """What `eval` and `pdf` return, for the price of one."""
+        """The results of `eval` and `pdf`, for the cost of one call."""
         return lobes.eval_pdf(self.blend, self._enter(wi), self._enter(wo))
 
     def sample(self, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
-        """Direction `wo` from three uniform numbers in [0, 1), with `eval_pdf` of it; pdf == 0: an invalid sample."""
+        """A direction `wo` from three uniform numbers in [0, 1), its value and its density (0: an invalid sample)."""
         wo, value, pdf = lobes.sample(self.blend, self._enter(wi), u_lobe, u1, u2)
         return (wo if self.plane is None else self.plane.leave(wo)), value, pdf
 

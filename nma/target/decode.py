@@ -1,7 +1,7 @@
-"""From the raw outputs of a network to a blend, and from a blend to plain numbers and back.
+"""Converts raw network outputs to a blend, a blend to a flat list of numbers, and both back.
 
-Layout everywhere: the parameters of instance 1, of instance 2, ..., then the blends. The ranges are data: weights files
-carry them.
+All lists have the same order: the parameters of instance 1, of instance 2, and so on, then the weights of the blend.
+The parameters' ranges are stored in weights files.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from nma.target.principled import MIN_ALPHA, Principled
 
 Scale = Literal["linear", "log"]
 ENCODE_MARGIN = (
-    1e-6  # fraction of a range that `encode` keeps away from its ends, where no finite output leads
+    1e-6  # `encode` stays this fraction of a range away from its ends, which no finite output reaches
 )
 
 
 @dataclass(frozen=True)
 class TargetParam:
-    """A field of `Principled` that the network sets: its size and the range its raw outputs are decoded to.
+    """A field of `Principled` that the network sets: its size, and the range to which raw outputs are decoded.
 
-    `in_plane` belongs to `anisotropic` in isotropic classes: the x axis of the lobes lies in the plane of incidence
-    (`nma.target.plane`), and the value fades by sin^2(theta_i) towards normal incidence, where there is no such plane.
+    `in_plane` is for the field `anisotropic` of isotropic classes: the x axis of the lobes lies in the plane of
+    incidence (`nma.target.plane`). The value is multiplied by sin^2(theta_i), because there is no such plane at normal
+    incidence.
     """
 
     name: str
@@ -39,22 +40,22 @@ class TargetParam:
     in_plane: bool = False
 
     def decode(self, raw: Float) -> Float:
-        """Any real number to the range: its sigmoid, spread linearly or by powers."""
+        """Maps any real number to the range: its sigmoid, scaled linearly or logarithmically."""
         unit = ops.sigmoid(raw)
         if self.scale == "log":
             return self.low * ops.exp(math.log(self.high / self.low) * unit)
         return self.low + (self.high - self.low) * unit
 
     def encode(self, value: Float) -> Float:
-        """Inverse of `decode`, clipped away from the ends of the range."""
+        """The inverse of `decode`. The value is first clipped away from the ends of the range."""
         if self.scale == "log":
             value = ops.maximum(value, self.low)
             return logit(ops.log(value * (1.0 / self.low)) * (1.0 / math.log(self.high / self.low)))
         return logit((value - self.low) * (1.0 / (self.high - self.low)))
 
 
-# The paper's 11 numbers. `specular` reaches an index of refraction of 2.1, Burley's ends at 1.8. The floor of alpha
-# bounds the roughness.
+# The paper's 11 parameters. The range of `specular` reaches an index of refraction of 2.1; Burley's ends at 1.8. The
+# smallest roughness follows from the smallest alpha.
 PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
     TargetParam("base_color", size=3),
     TargetParam("roughness", low=math.sqrt(MIN_ALPHA), scale="log"),
@@ -67,24 +68,26 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
     TargetParam("clearcoat_gloss"),
 )
 
-# Lobes of isotropic materials that are wider or narrower in the plane of incidence than a reflection's: light refracted
-# twice, say. The width along the plane is 1/6.4 to 6.9 times that across it.
+# Isotropic materials may have lobes that are wider or narrower in the plane of incidence than a reflection's lobe, for
+# example where light is refracted twice. The width along the plane is 1/6.4 to 6.9 times the width across it.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
-# What measured materials need besides. RGL's, say, are zero where the half vector is tilted by more than about 70
-# degrees: the instrument does not reach there. A wide fade shapes the diffuse lobe.
+# Measured materials need three more parameters. RGL's measurements, for example, are zero where the half vector is
+# tilted by more than about 70 degrees, because the instrument does not reach there. A wide fade shapes the diffuse
+# lobe.
 MEASURED_PARAMS = (
     *STRETCHED_PARAMS,
     TargetParam("flatness"),
     TargetParam("fade", low=-0.3),
     TargetParam("fade_width", low=0.01, high=1.5, scale="log"),
 )
-# The same for materials that know no plane of incidence but axes of their own: x and y of the surface.
+# The same for anisotropic materials. Their lobes stretch along the x and y axes of the surface, not along the plane of
+# incidence.
 ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
-# What fields of the Principled BRDF are defined for that are no numbers of 0 .. 1.
+# Ranges on which fields of the Principled BRDF are defined; all other fields have 0 .. 1.
 _LIMITS = {
-    "specular": (0.0, 12.0),  # from 12.5 on there is no such index of refraction
+    "specular": (0.0, 12.0),  # from 12.5 on no index of refraction has such a reflectance
     "anisotropic": (-1e6, 1.0),
     "fade": (-1.0, 1.0),
     "fade_width": (0.0, 1e6),
@@ -99,12 +102,12 @@ TARGETS = {
 
 
 def params_to_json(params: Sequence[TargetParam]) -> list[dict[str, Any]]:
-    """The declaration as plain data for a weights file."""
+    """The parameters as JSON data for a weights file."""
     return [asdict(p) for p in params]
 
 
 def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
-    """Inverse of `params_to_json`. Raises `WeightsError` where a declaration makes no sense for this version."""
+    """The inverse of `params_to_json`. Raises `WeightsError` for parameters that this version does not support."""
     try:
         params = tuple(TargetParam(**entry) for entry in data)
     except TypeError as e:
@@ -120,7 +123,7 @@ def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
 
 
 def _check(p: TargetParam) -> None:
-    """Refuses a parameter that `Principled` does not have, or a range that it is not defined for."""
+    """Raises `WeightsError` for a parameter that `Principled` does not have, or a range on which it is not defined."""
     size = 3 if p.name == "base_color" else 1
     if p.name not in Principled._fields or type(p.size) is not int or p.size != size:
         raise WeightsError(f"Target parameter {p} is not one of {Principled._fields} with its size.")
@@ -135,22 +138,22 @@ def _check(p: TargetParam) -> None:
 
 
 def limits(field: str) -> tuple[float, float]:
-    """What a field of `Principled` is defined for: the range of a parameter lies within."""
+    """The range on which a field of `Principled` is defined. The range of a `TargetParam` lies within it."""
     return _LIMITS.get(field, (0.0, 1.0))
 
 
 def instance_size(params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
-    """Numbers per instance: 11 for the paper's parameters."""
+    """How many numbers describe an instance: 11 for the paper's parameters."""
     return sum(p.size for p in params)
 
 
 def output_size(n_instances: int, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
-    """Numbers that describe a blend: all instances' and n - 1 blends; 23 for the paper's two instances."""
+    """How many numbers describe a blend: those of n instances and n - 1 weights; 23 for the paper's two instances."""
     return n_instances * instance_size(params) + n_instances - 1
 
 
 def logit(unit: Float) -> Float:
-    """Inverse of the sigmoid, clipped to finite values."""
+    """The inverse of the sigmoid, clipped to finite values."""
     u = ops.clip(unit, ENCODE_MARGIN, 1.0 - ENCODE_MARGIN)
     return ops.log(u / (1.0 - u))
 
@@ -161,8 +164,11 @@ def decode(
     params: Sequence[TargetParam] = PRINCIPLED_PARAMS,
     cos_theta_i: Float = 0.0,
 ) -> Blend:
-    """Raw network outputs, `output_size` of them, to a blend. Weights come from breaking a stick: each blend takes its
-    share of what the instances before it left. `cos_theta_i` matters to parameters that are `in_plane`."""
+    """Converts raw network outputs, `output_size` of them, to a blend.
+
+    The weights come from breaking a stick: each instance takes a share of what is left by the instances before it, and
+    the last instance takes the rest. `cos_theta_i` is used for parameters that are `in_plane`.
+    """
     size = instance_size(params)
     instances = tuple(
         _instance(_decoded(raw[k * size : (k + 1) * size], params, cos_theta_i), params)
@@ -178,7 +184,7 @@ def decode(
 
 
 def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
-    """Raw outputs that `decode` turns into (nearly) this blend: a starting point for a fit."""
+    """Raw outputs that `decode` converts to nearly this blend; a fit can start from them."""
     raw: list[Float] = []
     for p in blend.instances:
         for param in params:
@@ -192,8 +198,9 @@ def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> l
 
 
 def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
-    """The blend as plain numbers: parameters, then all weights but the last. Curves over cos(theta_i) interpolate them:
-    any convex combination of such lists describes a valid blend again.
+    """The blend as a flat list: all parameters, then all weights except the last.
+
+    Curves over cos(theta_i) interpolate such lists: a convex combination of them describes a valid blend again.
     """
     flat: list[Float] = []
     for p in blend.instances:
@@ -204,12 +211,12 @@ def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> 
 
 
 def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> Blend:
-    """Inverse of `numbers`; the number of instances follows from the length."""
+    """The inverse of `numbers`. The count of instances follows from the length of the list."""
     size = instance_size(params)
     n = (len(flat) + 1) // (size + 1)
     if n < 1 or len(flat) != output_size(n, params):
         raise WeightsError(
-            f"{len(flat)} numbers describe no blend: one needs {size} per instance and one per blend."
+            f"{len(flat)} numbers describe no blend: it has {size} per instance, and a weight for all but the last."
         )
     instances = tuple(_instance(flat[k * size : (k + 1) * size], params) for k in range(n))
     weights = tuple(flat[n * size :])
@@ -224,7 +231,7 @@ def _decoded(raw: Sequence[Float], params: Sequence[TargetParam], cos_theta_i: F
 
 
 def _instance(values: Sequence[Float], params: Sequence[TargetParam]) -> Principled:
-    """An instance from its numbers; parameters that are not declared are off."""
+    """An instance from its numbers; fields that are not in `params` are 0."""
     fields: dict[str, Any] = dict.fromkeys(Principled._fields, 0.0)
     first = 0
     for p in params:

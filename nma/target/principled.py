@@ -1,20 +1,22 @@
-"""One Principled BRDF: evaluation, sampling and density (Burley 2012 and 2015), written once for every language.
+"""One Principled BRDF (Burley 2012 and 2015): its value and the sampling densities of its lobes.
 
 Dialect "mitsuba-principled-reflection": the reflection side (spec_trans = 0) of Mitsuba 3.9's `principled`. Directions
 follow CONVENTIONS.md: local frame, z up, `wi` towards the viewer, `wo` towards the light, values are f cos(theta_o).
 
 Deliberate differences from Mitsuba's plugin, all of them small:
-- Peaks of narrow lobes keep their digits: GGX and GTR1 are written with the components of the half vector, never with
-  1 + (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is off by several per cent at alpha .001.
-- `specular` may vary like every other number, and 0 means no dielectric reflection (Mitsuba drops that of metals, too).
+- Narrow peaks are more precise. GGX and GTR1 are computed from the components of the half vector, never from 1 +
+  (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is wrong by several per cent at alpha .001.
+- `specular` may vary over the surface, and 0 means no dielectric reflection. In Mitsuba, 0 also removes the reflection
+  of metals.
 - The cosine between a direction and the half vector is |wi + wo| / 2, the same for both directions. Mitsuba takes the
-  dot product of `wi`, which rounding spoils where the directions are nearly opposite: both grazing, forward.
-- Tints divide by max(luminance, 1e-6), so they fade for colours darker than that instead of switching to white at zero.
-- Instances may fade out towards grazing half vectors (`fade`), where measurements end; Mitsuba's do not.
-- Directions within 1e-9 of the horizon are invalid, as are those below it (no back side).
-- Lobes are chosen by their estimated albedo, and one density covers the whole blend (`nma.target.blend`).
+  dot product of `wi` and the half vector. Rounding makes it inaccurate where both directions are grazing and nearly
+  opposite.
+- Tints divide by max(luminance, 1e-6). For colours darker than 1e-6 they fade to black; Mitsuba switches to white at 0.
+- An instance may fade out towards grazing half vectors (`fade`), where measurements end. Mitsuba's BRDF cannot.
+- Directions below the horizon (there is no back side), and directions within 1e-9 of it, are invalid.
+- Lobes are sampled in proportion to their estimated albedo, with one density for the whole blend (`nma.target.blend`).
 
-The functions here use straight-line arithmetic and `select` only: exporters print them in other languages.
+The functions here use only straight-line arithmetic and `select`, so that `nma.export` can print them as C++.
 """
 
 from __future__ import annotations
@@ -33,10 +35,12 @@ CLEARCOAT_F0 = 0.04
 
 
 class Principled(NamedTuple):
-    """Parameters of one Principled BRDF, in [0, 1] each (`specular` up to 1.8); the first nine hold the paper's 11.
+    """Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine are the paper's 11
+    numbers.
 
     `anisotropic` stretches the specular lobe along x; `flatness` blends towards the fake subsurface of Burley 2015.
-    Around half vectors at the cosine `fade` to the normal the whole fades out, within `fade_width`; 0 and 0: nowhere.
+    The whole BRDF fades out around the half vectors whose cosine to the normal is `fade`, over the width `fade_width`;
+    if both are 0, it does not fade.
     """
 
     base_color: Color
@@ -55,7 +59,7 @@ class Principled(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """What every lobe of every instance needs to know about one pair of directions."""
+    """Quantities of one pair of directions that all lobes of all instances share."""
 
     valid: Mask  # both directions above the horizon
     wi: Vec3
@@ -65,7 +69,7 @@ class Geometry(NamedTuple):
     weight_i: Float  # Schlick weights of the three cosines
     weight_o: Float
     weight_d: Float
-    clearcoat: Float  # clearcoat lobe but for its strength and its distribution of normals
+    clearcoat: Float  # clearcoat lobe without its strength and its distribution of normals
 
 
 class Terms(NamedTuple):
@@ -76,7 +80,7 @@ class Terms(NamedTuple):
 
 
 class Lobes(NamedTuple):
-    """Value of an instance [1/sr], and the density of each of its lobes as a sampler of `wo` [1/sr]."""
+    """The value of an instance [1/sr], and the density with which each of its lobes samples `wo` [1/sr]."""
 
     value: Color
     diffuse_pdf: Float
@@ -99,9 +103,9 @@ def masking_denominator(v: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
 
 
 def geometry(wi: Vec3, wo: Vec3) -> Geometry:
-    """Half vector, Schlick weights and the shared part of the clearcoat for unit directions `wi` and `wo`."""
+    """The half vector, Schlick weights and the shared part of the clearcoat, for unit directions `wi` and `wo`."""
     valid = (wi.z > MIN_COS) & (wo.z > MIN_COS)
-    # Invalid pairs continue with harmless cosines, so that neither values nor derivatives are ever infinite.
+    # Invalid pairs get the cosines 1, so that values and derivatives are always finite.
     i = Vec3(wi.x, wi.y, ops.select(valid, wi.z, 1.0))
     o = Vec3(wo.x, wo.y, ops.select(valid, wo.z, 1.0))
     h = i + o
@@ -134,12 +138,12 @@ def specular_f0(specular: Float) -> Float:
 
 
 def specular_eta(specular: Float) -> Float:
-    """Index of refraction whose reflectance at normal incidence is `specular_f0`."""
+    """The index of refraction whose reflectance at normal incidence is `specular_f0`."""
     return 2.0 / (1.0 - ops.safe_sqrt(specular_f0(specular))) - 1.0
 
 
 def dielectric_reflectance(cos: Float, cos2: Float, eta: Float) -> Float:
-    """Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Walter 2007, eq. 22."""
+    """Unpolarised Fresnel reflectance from the side of lower index; eta >= 1, cos >= 0. Walter 2007, eq. 22."""
     eta2 = eta * eta
     g = ops.sqrt(ops.maximum(eta2 - 1.0 + cos2, 1e-12))
     r_s = (cos - g) / (cos + g)
@@ -148,7 +152,7 @@ def dielectric_reflectance(cos: Float, cos2: Float, eta: Float) -> Float:
 
 
 def luminance_inverse(base_color: Color) -> Float:
-    """Factor that strips a colour of its brightness and leaves its tint. Burley 2012, section 5.3."""
+    """The factor that normalises a colour to luminance 1, which leaves its tint. Burley 2012, section 5.3."""
     return 1.0 / ops.maximum(ops.luminance(base_color), 1e-6)
 
 
@@ -179,13 +183,13 @@ def diffuse_terms(p: Principled, g: Geometry) -> Terms:
 
 
 def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms:
-    """Fresnel reflectance of metal, tinted and plain dielectric together.
+    """The Fresnel reflectance of metal, tinted dielectric and plain dielectric together.
 
-    `cos2` is cos^2, which a caller may know before the root that is `cos`; `weight` is `schlick_weight(cos)`.
+    `cos2` is cos^2, which some callers have before they take its root, and `weight` is `schlick_weight(cos)`.
     """
     tinted = (1.0 - p.metallic) * p.spec_tint
     plain = (1.0 - p.metallic) - tinted
-    # Schlick's F0 + (1 - F0) weight for both coloured parts, collected.
+    # Schlick's F0 + (1 - F0) weight for the metal and the tinted dielectric, collected into one F0.
     f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
     white = (
         plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight
@@ -194,23 +198,24 @@ def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms
 
 
 def faded(p: Principled, cos_h: Float) -> Float:
-    """Share that is left for a half vector at this cosine to the normal: a smooth step, 1/2 at `fade`."""
+    """The share of the BRDF left where the half vector's cosine to the normal is `cos_h`: a smooth step, 1/2 at
+    `fade`."""
     t = ops.clip((cos_h - p.fade) / ops.maximum(p.fade_width, 1e-6) + 0.5, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
-    """Value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe would be sampled."""
+    """The value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe samples `wo` [1/sr]."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    # Density of visible normals as reflected directions, D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
+    # Density of directions reflected about visible normals: D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
     spec_pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
-    # The value adds Fresnel and the other masking. Walter 2007, eq. 20, separable masking.
+    # The value also has the Fresnel term and the masking of `wo`, separable. Walter 2007, eq. 20.
     spec = spec_pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y))
-    # Normals drawn from D cos(theta_h), as reflected directions: D cos(theta_h) / (4 cos_d).
+    # Density of directions reflected about normals drawn from D cos(theta_h): D cos(theta_h) / (4 cos_d).
     clearcoat_d = gtr1_d(g.h, clearcoat_alpha(p.clearcoat_gloss))
     clearcoat_pdf = clearcoat_d * g.h.z / (4.0 * g.cos_d)
     clearcoat = p.clearcoat * clearcoat_d * g.clearcoat
-    # Every lobe is the base colour times one number plus another.
+    # Every lobe has the form base_color * colored + white.
     diffuse = diffuse_terms(p, g)
     fresnel = spec_fresnel(p, g.cos_d, g.cos_d * g.cos_d, g.weight_d)
     left = faded(p, g.h.z)

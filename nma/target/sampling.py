@@ -1,4 +1,4 @@
-"""How the lobes of one Principled BRDF are sampled; the densities stand with the values in `principled`."""
+"""Samples the lobes of one Principled BRDF. The densities are in `nma.target.principled`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def sample_diffuse(u1: Float, u2: Float) -> Vec3:
 
 
 def sample_spec(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) -> Vec3:
-    """A reflection of `wi` about a visible GGX normal; it may point below the horizon."""
+    """The reflection of `wi` about a random visible GGX normal; it may point below the horizon."""
     return reflect(wi, sample_visible_normal(wi, alpha_x, alpha_y, u1, u2))
 
 
 def sample_clearcoat(wi: Vec3, alpha: Float, u1: Float, u2: Float) -> Vec3:
-    """A reflection of `wi` about a normal drawn from GTR1 times its cosine. Burley 2012, appendix B, by its sine."""
+    """The reflection of `wi` about a random normal of density GTR1 times its cosine. Burley 2012, appendix B."""
     alpha2 = alpha * alpha
     phi = (2.0 * ops.PI) * u1
     sin2 = (ops.exp(ops.log(alpha2) * (1.0 - u2)) - alpha2) / (1.0 - alpha2)

@@ -22,7 +22,7 @@ template <class T> constexpr T SPEC_MARGIN = T(0.009);
 template <class T> constexpr T CLEARCOAT_MARGIN = T(0.005);
 template <class T> constexpr T MIN_ALBEDO = T(0.0001);
 
-// Parameters of one Principled BRDF, in [0, 1] each (`specular` up to 1.8); the first nine hold the paper's 11.
+// Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine are the paper's 11 numbers.
 template <class T>
 struct Principled {
     Vec3<T> base_color;
@@ -40,7 +40,7 @@ struct Principled {
     T fade_width;
 };
 
-// What every lobe of every instance needs to know about one pair of directions.
+// Quantities of one pair of directions that all lobes of all instances share.
 template <class T>
 struct Geometry {
     bool valid;
@@ -61,7 +61,7 @@ struct Terms {
     T white;
 };
 
-// Value of an instance [1/sr], and the density of each of its lobes as a sampler of `wo` [1/sr].
+// The value of an instance [1/sr], and the density with which each of its lobes samples `wo` [1/sr].
 template <class T>
 struct Lobes {
     Vec3<T> value;
@@ -70,7 +70,7 @@ struct Lobes {
     T clearcoat_pdf;
 };
 
-// What each lobe of an instance reflects of uniform light, at most.
+// Upper bounds of the directional albedo of each lobe of an instance.
 template <class T>
 struct Albedos {
     Vec3<T> diffuse;
@@ -78,7 +78,7 @@ struct Albedos {
     T clearcoat;
 };
 
-// A turn about the normal, given by cosine and sine of the azimuth that becomes 0.
+// A rotation about the normal, given by the cosine and sine of the azimuth that is turned to 0.
 template <class T>
 struct Plane {
     T cos_phi;
@@ -200,7 +200,7 @@ inline T masking_denominator(const Vec3<T>& v, T alpha_x, T alpha_y) {
     return v.z + sqrt(v.z * v.z + sx * sx + sy * sy);
 }
 
-// Half vector, Schlick weights and the shared part of the clearcoat for unit directions `wi` and `wo`.
+// The half vector, Schlick weights and the shared part of the clearcoat, for unit directions `wi` and `wo`.
 template <class T>
 inline Geometry<T> geometry(const Vec3<T>& wi, const Vec3<T>& wo) {
     const auto valid = wi.z > MIN_COS<T> && wo.z > MIN_COS<T>;
@@ -240,13 +240,13 @@ inline T specular_f0(T specular) {
     return T(0.08) * specular;
 }
 
-// Index of refraction whose reflectance at normal incidence is `specular_f0`.
+// The index of refraction whose reflectance at normal incidence is `specular_f0`.
 template <class T>
 inline T specular_eta(T specular) {
     return T(2.0) / (T(1.0) - safe_sqrt(specular_f0<T>(specular))) - T(1.0);
 }
 
-// Unpolarised Fresnel reflectance from the thinner side, eta >= 1, cos >= 0. Walter 2007, eq. 22.
+// Unpolarised Fresnel reflectance from the side of lower index; eta >= 1, cos >= 0. Walter 2007, eq. 22.
 template <class T>
 inline T dielectric_reflectance(T cos, T cos2, T eta) {
     const auto eta2 = eta * eta;
@@ -256,7 +256,7 @@ inline T dielectric_reflectance(T cos, T cos2, T eta) {
     return T(0.5) * (r_s * r_s + r_p * r_p);
 }
 
-// Factor that strips a colour of its brightness and leaves its tint. Burley 2012, section 5.3.
+// The factor that normalises a colour to luminance 1, which leaves its tint. Burley 2012, section 5.3.
 template <class T>
 inline T luminance_inverse(const Vec3<T>& base_color) {
     return T(1.0) / maximum(luminance(base_color), T(1e-06));
@@ -286,7 +286,7 @@ inline Terms<T> diffuse_terms(const Principled<T>& p, const Geometry<T>& g) {
     return Terms<T>{colored + tinted * luminance_inverse<T>(p.base_color), sheen - tinted};
 }
 
-// Fresnel reflectance of metal, tinted and plain dielectric together.
+// The Fresnel reflectance of metal, tinted dielectric and plain dielectric together.
 template <class T>
 inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     const auto tinted = (T(1.0) - p.metallic) * p.spec_tint;
@@ -297,14 +297,14 @@ inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     return Terms<T>{f0 * (T(1.0) - weight), white};
 }
 
-// Share that is left for a half vector at this cosine to the normal: a smooth step, 1/2 at `fade`.
+// The share of the BRDF left where the half vector's cosine to the normal is `cos_h`: a smooth step, 1/2 at `fade`.
 template <class T>
 inline T faded(const Principled<T>& p, T cos_h) {
     const auto t = clip((cos_h - p.fade) / maximum(p.fade_width, T(1e-06)) + T(0.5), T(0.0), T(1.0));
     return t * t * (T(3.0) - T(2.0) * t);
 }
 
-// Value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe would be sampled.
+// The value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe samples `wo` [1/sr].
 template <class T>
 inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
@@ -321,7 +321,7 @@ inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     return Lobes<T>{p.base_color * colored + white, g.wo.z * INV_PI<T>, spec_pdf, clearcoat_pdf};
 }
 
-// The diffuse lobe with its retro-reflection, integrated in closed form, and the sheen, fitted.
+// The bound of the diffuse lobe: base and retro-reflection integrated in closed form, plus a fit to the sheen.
 template <class T>
 inline Vec3<T> diffuse_albedo(const Principled<T>& p, T cos, T weight) {
     const auto r = p.roughness;
@@ -337,7 +337,7 @@ inline Vec3<T> diffuse_albedo(const Principled<T>& p, T cos, T weight) {
     return (p.base_color * base + tint * (p.sheen * sheen)) * (T(1.0) - p.metallic);
 }
 
-// The specular lobe, single scattering: masking at most 1, and Fresnel at the cosine of a typical facet.
+// The bound of the specular lobe (single scattering): a bound of the masking times Fresnel at a typical facet.
 template <class T>
 inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
@@ -350,7 +350,7 @@ inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
     return (p.base_color * fresnel.colored + fresnel.white) * unmasked + SPEC_MARGIN<T>;
 }
 
-// The clearcoat as if it were a mirror; it fades at grazing for lack of 1 / (4 cos_i cos_o).
+// The bound of the clearcoat, treated as a mirror.
 template <class T>
 inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
     const auto cos2 = cos * cos;
@@ -360,7 +360,7 @@ inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
     return p.clearcoat * (fresnel * cos2 * masking * masking + CLEARCOAT_MARGIN<T>);
 }
 
-// Bounds for `wi` at cos(theta_i) > 0; `flatness` is taken for 0, and nothing fades.
+// The bounds at cos(theta_i) > 0. They ignore `flatness` and `fade`.
 template <class T>
 inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
     const auto weight = schlick_weight<T>(cos_theta_i);
@@ -376,13 +376,13 @@ inline Vec3<T> sample_diffuse(T u1, T u2) {
     return Vec3<T>{r * cos(phi), r * sin(phi), safe_sqrt(T(1.0) - u2)};
 }
 
-// A reflection of `wi` about a visible GGX normal; it may point below the horizon.
+// The reflection of `wi` about a random visible GGX normal; it may point below the horizon.
 template <class T>
 inline Vec3<T> sample_spec(const Vec3<T>& wi, T alpha_x, T alpha_y, T u1, T u2) {
     return reflect<T>(wi, sample_visible_normal<T>(wi, alpha_x, alpha_y, u1, u2));
 }
 
-// A reflection of `wi` about a normal drawn from GTR1 times its cosine. Burley 2012, appendix B, by its sine.
+// The reflection of `wi` about a random normal of density GTR1 times its cosine. Burley 2012, appendix B.
 template <class T>
 inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
     const auto alpha2 = alpha * alpha;
@@ -392,7 +392,7 @@ inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
     return reflect<T>(wi, Vec3<T>{sin_theta * cos(phi), sin_theta * sin(phi), safe_sqrt(T(1.0) - sin2)});
 }
 
-// The plane through the normal and the unit direction `wi`; at normal incidence that of the x axis.
+// The plane through the normal and the unit direction `wi`; at normal incidence, the plane of the x axis.
 template <class T>
 inline Plane<T> plane_of(const Vec3<T>& wi) {
     const auto sin2 = wi.x * wi.x + wi.y * wi.y;
@@ -401,13 +401,13 @@ inline Plane<T> plane_of(const Vec3<T>& wi) {
     return Plane<T>{select(tilted, wi.x * inverse, T(1.0)), select(tilted, wi.y * inverse, T(0.0))};
 }
 
-// `v` as seen from the plane: `wi` itself gets the azimuth 0.
+// `v` in the frame of the plane, where `wi` has the azimuth 0.
 template <class T>
 inline Vec3<T> plane_enter(const Plane<T>& self, const Vec3<T>& v) {
     return Vec3<T>{self.cos_phi * v.x + self.sin_phi * v.y, self.cos_phi * v.y - self.sin_phi * v.x, v.z};
 }
 
-// Inverse of `enter`.
+// `v`, given in the frame of the plane, in the local frame: the inverse of `enter`.
 template <class T>
 inline Vec3<T> plane_leave(const Plane<T>& self, const Vec3<T>& v) {
     return Vec3<T>{self.cos_phi * v.x - self.sin_phi * v.y, self.sin_phi * v.x + self.cos_phi * v.y, v.z};
