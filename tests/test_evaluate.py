@@ -259,7 +259,7 @@ def test_figures_are_their_formulas():
 
 @pytest.mark.parametrize("scale", (1e-4, 0.01, 0.3, 2.0))
 def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
-    """The noise floor equals a Monte Carlo estimate of that loss, for noise much smaller to larger than the values."""
+    """The noise floor equals a Monte Carlo estimate of the loss of a perfect model, for small and for large noise."""
     rng = np.random.default_rng(4)
     b = rng.exponential(0.3, (500,))
     error = scale * rng.uniform(0.0, 1.0, 500)

@@ -1,8 +1,7 @@
 """Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and tests of the odds of the lobes.
 
-The tests compute in double precision. At grazing angles the narrowest lobes are 1e-5 wide, and in single precision the
-rounding of directions would change the counts of such narrow bins. test_target.py tests that both precisions draw the
-same directions.
+The tests compute in double precision. At grazing angles the narrowest lobes are 1e-5 wide. Rounding to single precision
+moves samples between such narrow bins. Tests in test_target.py show that both precisions draw the same directions.
 """
 
 import drjit as dr
