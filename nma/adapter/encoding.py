@@ -1,7 +1,7 @@
-"""What the network sees: a class's parameters and the view direction, turned into about unit-sized numbers.
+"""Encodings of the network's inputs: a class's parameters and the view direction as numbers of about unit size.
 
-Written with `nma.ops`, so that training, rendering and generated shaders share it. An encoding's name is stored in the
-weights file.
+They are written with `nma.ops`, so that training and rendering share them. Weights files store the name of the
+encoding.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from nma.microfacet import fresnel_conductor, fresnel_dielectric
 from nma.ops import Float, Vec3
 from nma.params import LAYERED3, ParamSpace
 
-# Takes one array per parameter column, and the view direction or, for an adapter that ignores it, None. Isotropic
-# encodings look at its z alone, cos(theta_i).
+# An encoder takes one array per parameter column and the view direction, which is None for adapters that ignore it.
+# Isotropic encodings use only its z, which is cos(theta_i).
 Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
-# Cosine of 84 degrees: where the reflectance of metals dips before it rises to 1.
+# Cosine of 84 degrees, near the dip of metals' reflectance before it rises to 1.
 GRAZING = 0.1045
-# Cosines of refraction below are taken for this one.
+# Smaller cosines of refraction are replaced by this one.
 MIN_COS_T = 0.05
 
 
@@ -35,8 +35,11 @@ def direction(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
 
 
 def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
-    """The whole direction, for one anisotropic material: its cosine, and its azimuth once and twice, both of which fade
-    towards normal incidence, where there is none."""
+    """The whole direction, for one anisotropic material: its cosine, and cosine and sine of its azimuth and of twice
+    that.
+
+    All except the cosine go to 0 at normal incidence, where there is no azimuth.
+    """
     if wi is None:
         raise ParamError("the encoding 'azimuth' reads the view direction; set `directional` in the recipe")
     x, y, z = wi
@@ -44,9 +47,12 @@ def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
 
 
 def layered3(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
-    """Physical quantities of a coated conductor: widths by their logarithm, the conductor by its reflectance inside the
-    coat at normal incidence and at 84 degrees, the coat's own Fresnel term at wi and the medium's transmittance along
-    the refracted direction."""
+    """Physical quantities of a coated conductor, all scaled to [-1, 1].
+
+    They are the logarithms of the widths; the coat's index and the medium's depth; the conductor's reflectance inside
+    the coat, at normal incidence and at 84 degrees; the medium's albedo; cos(theta_i); the coat's Fresnel reflectance
+    at wi; and the medium's transmittance along the refracted direction.
+    """
     alpha_top, alpha_bottom, eta_top, *rest = columns
     eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
     ranged = (
@@ -71,13 +77,13 @@ ENCODERS: dict[str, Encoder] = {
     "azimuth": azimuth,
     "layered3": layered3,
 }
-# Those of a single material, which see the direction alone; and those that tell azimuths apart.
+# Encodings for a single material, which use only the direction, and encodings that depend on the azimuth.
 SINGLE = ("direction", "azimuth")
 ANISOTROPIC = ("azimuth",)
 
 
 def get(name: str) -> Encoder:
-    """The encoder called `name`; `WeightsError` for one this version does not know."""
+    """The encoder with this name. Raises `WeightsError` if this version has no such encoder."""
     if name not in ENCODERS:
         raise WeightsError(
             f"unknown input encoding '{name}'; this version knows {', '.join(ENCODERS)}: upgrade the package"
@@ -86,5 +92,5 @@ def get(name: str) -> Encoder:
 
 
 def size(name: str, space: ParamSpace, directional: bool) -> int:
-    """Number of network inputs that an encoding makes of a class, with or without the direction."""
+    """The number of network inputs of an encoding for a class, with or without the direction."""
     return len(get(name)([0.5] * space.size, ops.at_azimuth_0(0.5) if directional else None))

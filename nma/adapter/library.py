@@ -1,7 +1,7 @@
 """A library: many materials in one small network, each a point of its latent space (paper Fig. 12).
 
-A library is an adapter of the class `library`, whose only parameter is a material's `code`, with the codes and names
-of the materials that it was trained on. Codes may be mixed, and one may be learned for a material that was not there.
+A library is an adapter of the class `library`, whose only parameter is the `code` of a material. With it come the codes
+and names of the materials on which it was trained. Codes can be mixed, and a code can be learned for a new material.
 
     library = Library.load("library.safetensors")
     code = library.mix(["gold-metallic-paint", "blue-rubber"], [0.7, 0.3])
@@ -28,7 +28,8 @@ CODES = "codes"
 
 @dataclass(frozen=True)
 class Library:
-    """An adapter of the class `library`, and its materials: `names`, and `codes` (n, 32) in their order."""
+    """An adapter of the class `library`, with the `names` of its materials and their `codes` (n, 32), in the same
+    order."""
 
     adapter: Adapter
     names: tuple[str, ...]
@@ -48,7 +49,7 @@ class Library:
 
     @staticmethod
     def load(path: str | Path) -> Library:
-        """Reads a library's weights file; `WeightsError` says what is wrong with it."""
+        """Reads the weights file of a library. Raises `WeightsError`, which says what is wrong with the file."""
         path = weights_file(path)
         adapter = Adapter.load(path)
         names = adapter.training.get("names")
@@ -68,7 +69,7 @@ class Library:
         return library
 
     def save(self, path: str | Path) -> None:
-        """Writes a weights file, atomically. `Adapter.load` and the C++ runtime read it as well."""
+        """Writes a weights file, atomically. `Adapter.load` and the C++ runtime also read such files."""
         training = {**self.adapter.training, "names": list(self.names)}
         replace(self.adapter, training=training).save(path, {CODES: self.codes})
 
@@ -78,7 +79,7 @@ class Library:
         return self.codes.size + network.parameters(self.adapter.layers)
 
     def code(self, name: str) -> NDArray[np.float32]:
-        """The code (32,) of a material. Raises `ParamError` for a name that is not there."""
+        """The code (32,) of a material. Raises `ParamError` if the library has no material of that name."""
         if name not in self.names:
             raise ParamError(
                 f"no material '{name}' among the library's {len(self.names)}; {hint(name, self.names)}"
@@ -86,7 +87,7 @@ class Library:
         return self.codes[self.names.index(name)]
 
     def mix(self, names: Sequence[str], weights: ArrayLike) -> NDArray[np.float32]:
-        """The code (32,) between those of some materials, in proportion to `weights`, which are at least 0."""
+        """The mean (32,) of the codes of some materials, weighted by `weights`, which are at least 0."""
         shares = np.asarray(weights, np.float64)
         if shares.shape != (len(names),) or not (np.isfinite(shares).all() and (shares >= 0).all()):
             raise ParamError(
@@ -98,7 +99,8 @@ class Library:
         return (shares / shares.sum() @ codes).astype(np.float32)
 
     def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
-        """One material as an adapter of its own that sees the direction alone: its code becomes part of the biases."""
+        """The material of a code as an ordinary adapter, whose only input is the direction: the code goes into the
+        biases."""
         code = LIBRARY.check(code)
         if len(code) != 1:
             raise ParamError(f"one code makes one material; got {len(code)}")
@@ -118,7 +120,7 @@ class Library:
         )
 
     def add(self, name: str, code: ArrayLike) -> Library:
-        """A library with one material more. Raises `ParamError` if it has one of that name."""
+        """A copy of the library with one more material. Raises `ParamError` if the name is taken."""
         if name in self.names:
             raise ParamError(f"the library has a material '{name}'; choose another name")
         codes = np.concatenate([self.codes, LIBRARY.check(code).astype(np.float32)])

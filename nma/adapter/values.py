@@ -1,4 +1,4 @@
-"""An adapter as a source: what it makes of one material."""
+"""One material of an adapter as a source, so that it can be compared and tabulated like any other."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from nma.ops import Color, Vec3
 
 
 class AdapterValues:
-    """One material of an adapter (`Values`), of parameters `params`, which one of a single material need not be told.
+    """One material of an adapter, as a source of values (`Values`).
 
-    Raises `ParamError` for parameters that the adapter does not know.
+    `params` are the parameters of the material; an adapter of a single material does not need them. Raises `ParamError`
+    for parameters for which the adapter was not trained.
     """
 
     def __init__(self, adapter: Adapter, params: ArrayLike = (), name: str = "adapter"):
@@ -22,7 +23,7 @@ class AdapterValues:
         if not given.size and adapter.space.size:
             if adapter.material is None:
                 raise ParamError(
-                    f"{name}: an adapter of the whole class {adapter.space.name}; name a material, too"
+                    f"{name}: an adapter of the whole class {adapter.space.name}; name a material"
                 )
             given = adapter.material
         self.params = adapter.check(given[None])[0].tolist()

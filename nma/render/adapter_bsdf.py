@@ -1,13 +1,13 @@
-"""Mitsuba 3 BSDF `nma`: an expensive source material as its adapter sees it, a blend of Principled BRDFs.
+"""Mitsuba 3 BSDF `nma`: a source material, evaluated by its adapter as a blend of Principled BRDFs.
 
-The network maps source parameters and cos(theta_i) to the blend; value, density and sampling are those of the blend.
-Without textures it runs when the scene is loaded, into curves over cos(theta_i); with textures, and for anisotropic
-adapters, at every shading point, once for all that a path tracer asks there. Inputs: `nma.render.inputs`. One-sided;
-wrap it in `twosided` if needed.
+The network maps source parameters and cos(theta_i) to the blend, which gives value, density and samples. Without
+textures the network runs once, when the scene is loaded, and fills curves over cos(theta_i). With textures, and for
+anisotropic adapters, it runs once per shading point. Inputs: `nma.render.inputs`. The BSDF is one-sided; wrap it in
+`twosided` if needed.
 
-Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond its training
-range are moved there instead of refused; and the parameters of the adapter's class, or a `material` that has them.
-One that knows a single material wants none, and refuses those of another.
+Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond the adapter's
+training range are moved to its bounds instead of refused; and the parameters of the adapter's class, or a `material`
+that has them. An adapter of a single material needs no parameters, and refuses the parameters of another material.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ALBEDO_POINTS = 128
 
 
 def define() -> type:
-    """The plugin's class for Mitsuba's present variant."""
+    """The plugin's class for Mitsuba's current variant."""
     import mitsuba
 
     from nma.jit import dr
@@ -42,7 +42,7 @@ def define() -> type:
     class Nma(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             self.name = str(props.get("adapter", DEFAULT_ADAPTER))
-            # Weights lie beside the scene, as the files of Mitsuba's own plugins do.
+            # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
             self.adapter = load_once(
                 self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
             )
@@ -55,7 +55,7 @@ def define() -> type:
         def parameters_changed(self, keys: Any = ()) -> None:
             try:
                 super().parameters_changed(keys)
-            finally:  # what was refused is undone, but the rest is edited
+            finally:  # refused edits were undone, but other parameters may have changed
                 if self._curves is not None:
                     self._curves.update(self.inputs.columns())
 
@@ -88,14 +88,14 @@ def define() -> type:
             return self._sampled(wo, pdf, over(value, pdf), active)
 
         def _from_light(self, ctx) -> bool:
-            """Whether the path came from the light, and that makes a difference."""
+            """Whether the path comes from the light and the BRDF is not reciprocal."""
             return ctx.mode == mi.TransportMode.Importance and not self.adapter.reciprocal
 
         def _towards_camera(self, si, wo, active) -> Color:
             """f cos(theta_o) of light that arrives along `si.wi` and goes on to the camera along `wo`.
 
-            The view is `wo` then, so the BRDF is prepared there: paths from the light see what those from the camera
-            do, although swapping the directions of a BRDF gives another value. Samples are drawn as for `si.wi`.
+            The view direction is then `wo`, so the BRDF is prepared for `wo`. Paths from the light thus get the same
+            values as paths from the camera, although the BRDF is not reciprocal. Samples are still drawn for `si.wi`.
             """
             turned = mi.SurfaceInteraction3f(si)
             turned.wi = wo
@@ -112,21 +112,21 @@ def define() -> type:
             return mean_of_samples(draw, ALBEDO_POINTS, active)
 
         def _make_curves(self) -> Curves | None:
-            """What spares the network where nothing but cos(theta_i) varies."""
+            """The curves that replace the network; None if more than cos(theta_i) varies, and the network must run."""
             if self.inputs.textured or self.adapter.anisotropic:
                 return None
             return Curves(self.adapter, self.inputs.columns())
 
         def _prepare(self, ctx, si, active) -> tuple[Brdf, Any]:
-            """The BRDF at `si`, and the lanes that see the front."""
+            """The BRDF at `si`, and which lanes see the front."""
             front = self._front(ctx, si, active)
             return self._brdf(si, active, front), front
 
         def _brdf(self, si, active, front) -> Brdf:
             """The BRDF at `si`.
 
-            Of one point Mitsuba asks for the value and then for a sample, even where one call could give both: it does
-            not call `eval_pdf_sample` of Python BSDFs. The second takes what the first left in the same basic block.
+            At a point Mitsuba calls `eval_pdf` and then `sample`; it does not call `eval_pdf_sample` of Python BSDFs.
+            The second call reuses the BRDF of the first call, if both are in the same basic block.
             """
             self.inputs.check()
             wi = Vec3(si.wi.x, si.wi.y, dr.clip(si.wi.z, MIN_COS, 1.0))
@@ -145,7 +145,7 @@ def define() -> type:
 
 
 def load_once(name_or_path: str) -> Adapter:
-    """The adapter of a name or a weights file; BSDFs of the same file share it for as long as the file is unchanged."""
+    """The adapter of a name or a weights file. BSDFs of the same file share it while the file does not change."""
     path = weights_file(name_or_path)
     stat = Path(path).stat() if Path(path).is_file() else None
     return _loaded(name_or_path, (stat.st_mtime_ns, stat.st_size) if stat else None)
@@ -159,11 +159,11 @@ def _loaded(name_or_path: str, stamp: tuple[int, int] | None) -> Adapter:
 class _Recorded:
     """The BRDF that a call prepared while Dr.Jit recorded it, for the next call in the same basic block.
 
-    Elsewhere its variables may not exist: Dr.Jit records all callables of a virtual call with the same arguments, in
-    scopes that begin anew. So what was prepared is followed by a scope of its own, and only that may take it. The
-    arguments are kept, as the numbers of Dr.Jit's variables are given out anew when one is gone. Nothing that has
-    derivatives is: these would be followed in the next pass, where they lead nowhere. Frozen functions do not look into
-    this class: they must not find symbolic variables.
+    In another block the variables of the BRDF may not exist: Dr.Jit records all callables of a virtual call with the
+    same arguments, each in a new scope. So `leave` opens a new scope, and `take` succeeds only in that scope. The
+    arguments are kept, because Dr.Jit reuses the indices of variables that are freed. A BRDF with derivatives is never
+    kept: the next pass would follow its derivatives to variables that no longer exist. Frozen functions do not look
+    into this class, because they must not find symbolic variables.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""What this package's Mitsuba BSDFs share: the variants they run in, one side, one glossy lobe, one kind of sample."""
+"""The common base of this package's Mitsuba BSDFs, which are one-sided and have one glossy lobe."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 from nma.ops import Color, Vec3, minimum, select
 
-# Mitsuba's variants that BSDFs written in Python run in: parameters are RGB, code is vectorised.
+# The Mitsuba variants in which our Python BSDFs run: their parameters are RGB, and their code is vectorised.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
-# Mitsuba's BSDFs that ask one other and hand on its answer.
+# Mitsuba's BSDFs that call one nested BSDF and return its result.
 _HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
 # Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": powers of the inverse of this number, the
 # root of x^4 = x + 1, spread points evenly over a cube.
@@ -18,12 +18,12 @@ _SPREAD = 1.2207440846057596
 
 
 def define_base() -> type:
-    """The class below all our BSDFs, for Mitsuba's present variant.
+    """The base class of all our BSDFs, for Mitsuba's current variant.
 
-    A BSDF of ours has `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`), these are
-    what `mi.traverse` and attributes show, and `differentiable` says whether derivatives reach them.
-    Its `__init__` calls the one here when nothing can fail any more: from then on Dr.Jit knows the BSDF and calls it in
-    all scenes, for as long as a traceback, say, keeps it.
+    A subclass defines `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`),
+    `mi.traverse` and attributes show them, and `differentiable` says whether derivatives reach them. A subclass calls
+    this `__init__` last, after everything that can fail. From then on the BSDF is registered in Dr.Jit, which calls it
+    in all scenes until it is destroyed, and a traceback could keep a failed BSDF alive.
     """
     import mitsuba
 
@@ -40,7 +40,8 @@ def define_base() -> type:
             self.serial = next(_serials)
 
         def _declare(self, *flags: mi.BSDFFlags) -> None:
-            """One component: glossy reflection on the front, with these flags besides, and with that of textures."""
+            """Declares one component: glossy reflection on the front, with `flags`, and with the flag for textures if
+            needed."""
             both = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             if self.inputs is not None and self.inputs.textured:
                 both |= mi.BSDFFlags.SpatiallyVarying
@@ -67,7 +68,7 @@ def define_base() -> type:
             return *self.eval_pdf(ctx, si, wo, active), *self.sample(ctx, si, sample1, sample2, active)
 
         def eval_diffuse_reflectance(self, si, active=True):
-            """The directional albedo at wi, at most 1: what denoisers and `aov` take for the colour of a surface."""
+            """The directional albedo at wi, at most 1. Denoisers and `aov` use it as the colour of the surface."""
             front = mi.Bool(active) & (si.wi.z > 0)
             albedo = self._albedo(si, front)
             return mi.Color3f(*(minimum(c, 1.0) for c in albedo)) & front
@@ -93,13 +94,14 @@ def define_base() -> type:
             return self.inputs.values if self.inputs is not None else ()
 
         def _front(self, ctx, si, active):
-            """The lanes that see the front, if our lobe is wanted."""
+            """Which lanes see the front of the surface; none if the context disables our lobe."""
             if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 return mi.Bool(False)
             return mi.Bool(active) & (si.wi.z > 0)
 
         def _sampled(self, wo: Vec3, pdf, weight: Color, active):
-            """What `sample` returns: a direction, its density, and value over density; all 0 where the density is."""
+            """The return value of `sample`: direction, density, and value over density. The last two are 0 for invalid
+            samples."""
             valid = active & (pdf > 0)
             bs = dr.zeros(mi.BSDFSample3f)
             bs.wo = mi.Vector3f(*wo)
@@ -115,7 +117,7 @@ def define_base() -> type:
 def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, active: Any = True) -> Color:
     """The mean of draw(k, u1, u2, u3) over the same `points` points of the unit cube for every lane, k = 0, 1, ...
 
-    Equal lanes give equal means: there is no noise, but the small error that so many points leave.
+    Equal lanes give equal means, so there is no noise. The finite number of points leaves a small error.
     """
     import mitsuba
 
@@ -136,20 +138,20 @@ def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, ac
 
 
 def over(value: Any, pdf: Any) -> Any:
-    """A value per density. Where the density is 0 it is the value as it is."""
+    """The value divided by the density; where the density is 0, the value unchanged."""
     return value * (1.0 / select(pdf > 0, pdf, 1.0))
 
 
 def vec3(v: Any) -> Vec3:
-    """A vector of Mitsuba's for the physics of this package."""
+    """A Mitsuba vector as this package's `Vec3`."""
     return Vec3(v.x, v.y, v.z)
 
 
 def blended(bsdf: Any) -> bool:
-    """Whether Mitsuba holds a BSDF that blends `bsdf` with others, by any levels between.
+    """Whether any existing Mitsuba BSDF blends `bsdf` with other BSDFs, directly or through nested BSDFs.
 
-    A BSDF is not told of those around it, so this looks through all that there are. Those that only turn a frame or a
-    side hand on what they are given.
+    A BSDF has no access to the BSDFs that contain it, so this function searches all existing BSDFs. BSDFs that only
+    change the frame or the side do not count as blends.
     """
     global _blends
     everything = _registered()
@@ -159,19 +161,19 @@ def blended(bsdf: Any) -> bool:
     return bsdf.serial in _blends[1]
 
 
-# Numbers of our BSDFs, never given out again: scenes that are loaded one after the other may share addresses and names.
+# Unique ids of our BSDFs. Addresses and names are not unique: scenes that are loaded one after another may share them.
 _serials = count(1)
-# What `blended` found last: in which BSDFs, and the numbers of ours inside a blend.
+# The last result of `blended`: all BSDFs at that time, and the ids of our BSDFs inside a blend.
 _blends: tuple[list[Any], set[int]] = [], set()
 
 
 def _serial(bsdf: Any) -> int:
-    """The number of one of our BSDFs; 0 for others."""
+    """The unique id of one of our BSDFs; 0 for other BSDFs."""
     return getattr(bsdf, "serial", 0)
 
 
 def _registered() -> list[Any]:
-    """All BSDFs of Mitsuba's present variant."""
+    """All existing BSDFs of Mitsuba's current variant."""
     import drjit
     import mitsuba
 
@@ -197,8 +199,11 @@ def _inside_blends(everything: list[Any]) -> set[int]:
 
 
 def _parts(bsdf: Any) -> list[Any]:
-    """The BSDFs inside of one, at all levels. Textures are not looked into: a coloured one works out its pixels when it
-    is, and while Dr.Jit records these would be symbolic ever after."""
+    """The BSDFs nested in `bsdf`, at all levels.
+
+    Textures are not traversed. Traversing a coloured texture computes its pixels, and if Dr.Jit is recording at that
+    moment, these pixels would stay symbolic.
+    """
     import mitsuba
 
     mi: Any = mitsuba  # its types change with the variant
@@ -214,7 +219,9 @@ def _parts(bsdf: Any) -> list[Any]:
         def put_object(self, name, value, flags):
             if isinstance(value, mi.BSDF):
                 found.append(value)
-                value.traverse(Parts())  # nanobind calls no method of an object within itself
+                value.traverse(
+                    Parts()
+                )  # nanobind does not call a method of an object from within that method
 
     bsdf.traverse(Parts())
     return found

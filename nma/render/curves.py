@@ -1,4 +1,4 @@
-"""The target of an untextured material as curves over cos(theta_i), so that rendering needs no network."""
+"""The target of an untextured material as curves over cos(theta_i), so that rendering does not run the network."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from nma.ops import Float, Vec3, at_azimuth_0
 from nma.target.brdf import Brdf
 from nma.target.decode import numbers
 
-# Over draws from the training ranges, values at the blend's own samples differed by 1e-4 on average from those of the
-# network at the same cosine, albedos by 1e-5. Closer nodes at grazing angles changed little.
+# For random materials of the training ranges, values at the blend's own samples differed by 1e-4 on average from the
+# network's values at the same cosine, and albedos by 1e-5. Closer nodes at grazing angles changed little.
 NODES = 128
-# Numbers that one gather fetches. Dr.Jit loads powers of two together; 24 numbers took three loads of 8.
+# How many numbers one gather fetches. Dr.Jit fetches a power of two at once; 24 numbers take three gathers of 8.
 PACKET = 8
-# Cosines below are taken for this one: an adapter need not know what happens at the very horizon.
+# Smaller cosines are replaced by this one, so that no adapter is evaluated exactly at the horizon.
 MIN_COS = 1e-4
 
 
 class Curves:
     """The numbers of a blend (`nma.target.numbers`) at fixed cosines, linearly interpolated between them.
 
-    Any mixture of such numbers is a valid blend again. Derivatives reach the parameters that the curves were made from
-    by tables of slopes, not through what computed the curves: forward derivatives and frozen functions of Dr.Jit see
-    nothing of that.
+    Any mixture of such numbers is a valid blend again. Derivatives with respect to the parameters come from tables of
+    slopes. They do not go through the computation of the curves, because forward derivatives and frozen functions of
+    Dr.Jit could not follow it.
     """
 
     # Frozen functions of Dr.Jit look for variables here.
@@ -35,9 +35,9 @@ class Curves:
     def __init__(self, adapter: Adapter, columns: Sequence[Float], nodes: int = NODES):
         """
         Args:
-            adapter: whose network is evaluated.
+            adapter: its network is evaluated to make the curves.
             columns: `mi.Float` of width 1 for each column of the class's parameter vector.
-            nodes: number of cosines; two will do if the target ignores the direction.
+            nodes: number of cosines; two are used if the target does not depend on the direction.
 
         Raises `ParamError` for anisotropic adapters.
         """
@@ -50,7 +50,7 @@ class Curves:
         self.update(columns)
 
     def update(self, columns: Sequence[Float]) -> None:
-        """Makes the curves of other parameters, by the same kernels where only the numbers are others."""
+        """Makes the curves anew for other parameters. The kernels are reused if only the values changed."""
         self.table = self._tabulated([dr.detach(column) for column in columns])
         dr.eval(self.table)
         self.slopes = {
@@ -58,24 +58,25 @@ class Curves:
         }
 
     def at(self, wi: Vec3, columns: Sequence[Float], active: Any = True) -> Brdf:
-        """The BRDF seen from `wi`; `columns` are those that the curves were made from, for derivatives."""
+        """The BRDF seen from `wi`. `columns` are the parameters from which the curves were made; derivatives need
+        them."""
         flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
-                change = columns[k] - dr.detach(columns[k])  # 0, but for its derivative
+                change = columns[k] - dr.detach(columns[k])  # its value is 0, its derivative is not
                 steps = self._looked_up(slope, wi.z, active)
                 flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
         return self.adapter.from_numbers(flat, wi)
 
     def _tabulated(self, columns: Sequence[Float]) -> Float:
-        """Node by node, filled up to whole packets."""
+        """The numbers of all nodes, one node after another, padded to whole packets."""
         cosines = dr.maximum(dr.linspace(_mitsuba().Float, 0.0, 1.0, self.nodes), MIN_COS)
         made = _prepare(self.adapter, self.layers, columns, at_azimuth_0(cosines))
         flat = numbers(made.blend, self.adapter.target)
         return _interleaved(flat + [0.0] * (self.packets * PACKET - self.adapter.size), self.nodes)
 
     def _slope(self, columns: Sequence[Float], k: int) -> Float:
-        """The derivative of the table by one column."""
+        """The derivative of the table with respect to column `k`."""
         mi = _mitsuba()
         columns = [mi.Float(dr.detach(column)) for column in columns]
         dr.enable_grad(columns[k])
@@ -85,7 +86,7 @@ class Curves:
         return slope
 
     def _looked_up(self, table: Float, cos_theta_i: Float, active: Any) -> list[Float]:
-        """The numbers in a table at cos(theta_i)."""
+        """The numbers of a table, interpolated at cos(theta_i)."""
         mi = _mitsuba()
         position = dr.clip(cos_theta_i, 0.0, 1.0) * (self.nodes - 1)
         left = dr.minimum(mi.UInt32(position), self.nodes - 2)
@@ -103,7 +104,7 @@ class Curves:
 
 
 def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], wi: Vec3) -> Brdf:
-    """`Adapter.prepare` by products of matrices: a few small kernels instead of a large one to compile."""
+    """`Adapter.prepare` with matrix products: a few small kernels, which compile faster than one large kernel."""
     mi = _mitsuba()
     inputs = encoding.get(adapter.encoding)(columns, wi if adapter.directional else None)
     x = mi.TensorXf(_interleaved(inputs, dr.width(wi.z)), (dr.width(wi.z), len(inputs)))
@@ -112,7 +113,7 @@ def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], wi: 
 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:
-    """All first entries, then all second ones, ..., of numbers and arrays of that width."""
+    """The first entry of each value, then the second entry of each, and so on. Scalars are repeated to `width`."""
     mi = _mitsuba()
     return dr.ravel(mi.ArrayXf([mi.Float(value) + dr.zeros(mi.Float, width) for value in values]))
 

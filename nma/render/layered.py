@@ -1,13 +1,14 @@
-"""Mitsuba 3 BSDF `layered`: the simulated material itself, the reference for its adapter.
+"""Mitsuba 3 BSDF `layered`: the simulated material, which is the reference for its adapter.
 
-`eval` is one unbiased estimate, so no two evaluations agree; their means do. It is given no random numbers and makes
-its own from the bits of its arguments. Multiple importance sampling stays unbiased with any density of wi and wo that
-is positive where f is, provided all methods report the same; that is `pdf`.
+`eval` returns one unbiased random estimate. Mitsuba passes it no random numbers, so it makes them from the bits of its
+arguments. Multiple importance sampling stays unbiased with any density that is positive where f is positive, as long as
+all methods report the same density. This density is `pdf`.
 
-`sample` is one walk. What blends BSDFs (`blendbsdf`, `mask`) takes weight times pdf for the value of a sample, which no
-walk knows. Inside of those, `sample` draws from `pdf` and weighs by an estimate of the value: right in any combination,
-but with 1 to 1.4 times the variance of a walk, and slower.
-Inputs: `nma.render.inputs`, with the parameters of class `layered3`. One-sided; wrap it in `twosided` if needed.
+`sample` is one random walk. BSDFs that blend others (`blendbsdf`, `mask`) assume that weight times pdf is the value of
+a sample, which does not hold for a walk. Inside such a BSDF, `sample` draws a direction from `pdf`, and its weight is
+an estimate of the value over `pdf`. This is right in any combination, but it is slower and has 1 to 1.4 times the
+variance of a walk. Inputs: `nma.render.inputs`, with the parameters of class `layered3`. One-sided; wrap it in
+`twosided` if needed.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3, Stack
 
-# Walks behind the albedo of a point, with the same random numbers everywhere: no noise, but an error of about .03.
+# Walks from which the albedo of a point is computed. Their random numbers are the same everywhere, so there is no
+# noise, but an error of up to .06.
 ALBEDO_WALKS = 128
 
 
 def define() -> type:
-    """The plugin's class for Mitsuba's present variant."""
+    """The plugin's class for Mitsuba's current variant."""
     import mitsuba
 
     from nma.jit import dr
@@ -66,7 +68,7 @@ def define() -> type:
                 return self._sampled(vec3(wo), pdf, vec3(weight), active & dr.any(weight > 0))
 
         def _prepare(self, ctx, si, active) -> tuple[Stack, Any]:
-            """The stack at `si`, and the lanes that see its front."""
+            """The stack at `si`, and which lanes see its front."""
             self.inputs.check()
             front = self._front(ctx, si, active)
             return self._stack(si, front), front
@@ -75,12 +77,12 @@ def define() -> type:
             return layered_eval.settle(source.gather(self.inputs.columns(si, active)))
 
         def _walk(self, stack, si, u, active):
-            """One walk's direction and throughput."""
+            """The direction and the throughput of one walk."""
             wo, throughput = walk(source, stack, vec3(si.wi), _random(*u, *si.wi), active)
             return mi.Vector3f(*wo), mi.Color3f(*throughput)
 
         def _draw(self, stack, si, u, active):
-            """A direction of density `pdf`, and an estimate of the value there over it."""
+            """A direction drawn from `pdf`, and an estimate of its value divided by `pdf`."""
             wo = mi.Vector3f(*layered_eval.sample(stack, vec3(si.wi), *u))
             value, pdf = self._estimate(stack, si, wo, active)
             return wo, over(value, pdf)
@@ -103,14 +105,14 @@ def define() -> type:
                 return mean_of_samples(draw, ALBEDO_WALKS, active)
 
     def _random(*numbers: Any) -> Any:
-        """A random stream that depends on the bits of `numbers`."""
+        """A random stream seeded by the bits of `numbers`."""
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(x)) for x in numbers]
         a, b = mi.UInt32(len(bits)), mi.UInt32(0x9E3779B9)
         for i, x in enumerate(bits):
             a, b = (a ^ x, b) if i % 2 == 0 else (a, b ^ x)
             if i % 2 == 1 or i == len(bits) - 1:
                 a, b = mi.sample_tea_32(a, b)
-        rng = mi.PCG32()  # whose own way to start gives every lane a stream of its own
+        rng = mi.PCG32()  # its own seeding would also depend on the lane
         rng.state, rng.inc = (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(b) << 1) | 1
         return rng
 

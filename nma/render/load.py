@@ -1,4 +1,4 @@
-"""Loading scenes, named materials and material files into Mitsuba, with errors of one line."""
+"""Loads scenes, named materials and material files into Mitsuba, with error messages of one line."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.textures import bitmap_texture
 
-# How the names of images end that Mitsuba reads.
+# File name endings of the images that Mitsuba reads.
 _IMAGES = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 
 MODELS = ("nma", "layered")
 
 
 class SceneError(NmaError, RuntimeError):
-    """Mitsuba cannot load a scene; the message says where, and what it or our plugin found wrong."""
+    """Mitsuba cannot load a scene; the message says where and why."""
 
 
 def material_bsdf(
@@ -30,14 +30,14 @@ def material_bsdf(
     """The Mitsuba dictionary of a source material.
 
     Args:
-        material: from `nma.materials.load`; its textures are read and checked here.
-        model: "nma", the adapter, or "layered", the reference.
+        material: returned by `nma.materials.load`. Its textures are read and checked here.
+        model: "nma" (the adapter) or "layered" (the reference).
         adapter: name of a shipped adapter or a weights file, for "nma".
-        clamp: let the adapter move parameters beyond its training range to the range, instead of refusing them.
+        clamp: whether parameters beyond the adapter's training range are moved to its bounds, or refused.
 
     Raises:
-        ParamError: an unknown model.
-        TextureError: a texture that cannot be read or holds forbidden values.
+        ParamError: the model is unknown.
+        TextureError: a texture cannot be read, or holds values that are not allowed.
     """
     if model not in MODELS:
         raise ParamError(f"unknown model {model!r}; take {either(MODELS)}")
@@ -46,7 +46,7 @@ def material_bsdf(
 
 
 def load_dict(description: Mapping[str, Any]) -> Any:
-    """`mi.load_dict`, its errors as `SceneError`."""
+    """Calls `mi.load_dict`; its errors become `SceneError`."""
     import mitsuba as mi
 
     try:
@@ -61,12 +61,12 @@ def load_scene(
     """A Mitsuba scene from an XML file.
 
     Args:
-        define: values of the file's own parameters, `$name` in the file.
-        size: width and height in pixels, instead of the file's, of the first sensor.
+        define: values of the parameters that the file writes as `$name`.
+        size: width and height in pixels for the first sensor, in place of those in the file.
 
     Raises:
         SceneError: there is no such file, or Mitsuba cannot load it.
-        ImageError: an image of absurd size.
+        ImageError: an image of the scene is too large.
     """
     import mitsuba as mi
 
@@ -89,7 +89,7 @@ def load_scene(
 
 
 def _check_images(path: Path) -> None:
-    """Refuses images of absurd size that the file names, before Mitsuba takes memory for their pixels."""
+    """Raises `ImageError` for a too large image named in the file, before Mitsuba takes memory for its pixels."""
     for name in re.findall(rb'value\s*=\s*"([^"]+)"', path.read_bytes()):
         image = path.parent / os.fsdecode(name)
         if image.suffix.lower() in _IMAGES and image.is_file():

@@ -1,4 +1,4 @@
-"""Makes this package's BSDFs known to Mitsuba, in whatever variant is chosen."""
+"""Registers this package's BSDF plugins with Mitsuba, in every variant that is chosen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nma.errors import ParamError
 from nma.native import build
 from nma.render.bsdf import VARIANTS
 
-# Name of the plugin, and the module whose `define()` makes its class for the present variant.
+# Name of each plugin, and the module whose `define()` makes its class for the current variant.
 PLUGINS = {
     "layered": "nma.render.layered",
     "nma": "nma.render.adapter_bsdf",
@@ -21,9 +21,9 @@ _registered = False
 
 
 def register() -> None:
-    """Registers the plugins now, if a variant is set, and again after every `mi.set_variant`. Harmless to repeat.
+    """Registers the plugins now, if a variant is set, and again after every `mi.set_variant`. Further calls do nothing.
 
-    Mitsuba keeps Python plugins per variant. For scalar_rgb and the `mitsuba` executable there are compiled ones: `nma
+    Mitsuba keeps Python plugins per variant. scalar_rgb and the `mitsuba` executable need compiled plugins: `nma
     mitsuba build`.
     """
     global _registered
@@ -41,7 +41,7 @@ def _on_variant(old: str | None, new: str) -> None:
     import mitsuba as mi
 
     if new == "scalar_rgb" and build.has_mitsuba_plugins():
-        # Python ones of the same name would hide them.
+        # Python plugins of the same name would hide the compiled plugins.
         _add_resource(str(build.mitsuba_folder()))
         return
     for name, module in PLUGINS.items():
@@ -50,7 +50,7 @@ def _on_variant(old: str | None, new: str) -> None:
 
 
 def _refuse(variant: str, props: Any) -> Any:
-    """In place of a BSDF, where a variant has none of ours."""
+    """Raises an error in place of making a BSDF, for variants in which our BSDFs do not run."""
     raise ParamError(
         f"BSDF '{props.plugin_name()}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters "
         "are RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for "

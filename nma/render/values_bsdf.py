@@ -1,9 +1,9 @@
-"""Mitsuba 3 BSDF `values`: a source that knows its value, such as a measurement, as it is, without an adapter.
+"""Mitsuba 3 BSDF `values`: renders a source with known values, such as a measurement, without an adapter.
 
-Properties: `file`, anything that `nma.sources.read` understands, and `material`, which chooses in a file of several; or
-`source`, the number of one in memory, which `bsdf_of` gives out.
-Isotropic or not, one-sided, the same everywhere on a surface. Directions are drawn from a fixed mixture of lobes, a
-cosine and three reflections, whatever the material: unbiased, but a reference for converged pictures, not a fast one.
+Properties: `file`, any file that `nma.sources.read` reads, and `material`, which chooses a material of a file with
+several. Or `source`, the index of a source in memory, as `bsdf_of` sets it. The BSDF may be anisotropic, is one-sided,
+and is the same everywhere on a surface. Directions are drawn from the same mixture of lobes for all materials: a cosine
+lobe and three reflections. This is unbiased but noisy, so it suits converged reference pictures.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.sources.base import Values
 from nma.target import Blend, Principled
 
-# Points of the quadrature that gives the albedo.
+# Number of points of the quadrature of the albedo.
 ALBEDO_POINTS = 256
-# Widths of the reflections that directions are drawn from, beside the cosine.
+# Widths (alpha) of the reflection lobes from which directions are drawn.
 _ALPHAS = (0.02, 0.08, 0.3)
 _WHITE = Color(1.0, 1.0, 1.0)
 
@@ -33,19 +33,19 @@ _PROPOSAL = Blend(
     (1.0 / (len(_ALPHAS) + 1),) * (len(_ALPHAS) + 1),
 )
 
-# Sources that scenes refer to by their place, as descriptions of scenes hold no objects of Python.
+# Sources to which scenes refer by index, because a scene's dictionary cannot hold Python objects.
 _IN_MEMORY: list[Values] = []
 
 
 def bsdf_of(source: Values) -> dict[str, Any]:
-    """The Mitsuba dictionary of a source in memory, which is kept for as long as the program runs."""
+    """The Mitsuba dictionary of a source in memory. The source is then kept until the program ends."""
     if source not in _IN_MEMORY:
         _IN_MEMORY.append(source)
     return {"type": "values", "source": _IN_MEMORY.index(source)}
 
 
 def define() -> type:
-    """The plugin's class for Mitsuba's present variant."""
+    """The plugin's class for Mitsuba's current variant."""
     import mitsuba
 
     mi: Any = mitsuba  # its types change with the variant
@@ -58,7 +58,7 @@ def define() -> type:
 
         @staticmethod
         def _read(props: mi.Properties) -> Values:
-            # Files lie beside the scene, as those of Mitsuba's own plugins do.
+            # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
             path = str(mi.file_resolver().resolve(str(props["file"])))
             return sources.read(path, str(props["material"]) if "material" in props else None)
 
@@ -78,7 +78,7 @@ def define() -> type:
             return mean_of_samples(lambda k, *u: self._draw(vec3(si.wi), u, active)[2], ALBEDO_POINTS, active)
 
         def _draw(self, wi, u, active):
-            """A direction, its density, and the value over it."""
+            """A direction, its density, and its value divided by the density."""
             wo, _, _ = target.sample(_PROPOSAL, wi, *u)
             value, pdf = self._eval_pdf(wi, wo, active)
             return wo, pdf, over(value, pdf)
