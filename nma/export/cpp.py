@@ -27,8 +27,8 @@ _HEAD = """\
 namespace nma {
 """
 _FIELDS = """\
-// A field of `Principled`. `first` is the index of its first number, if `Principled` is an array of numbers. `size` is
-// its count of numbers. It is defined for values in low .. high.
+// A field of `Principled`. It has `size` numbers, with values in low .. high. `first` is the index of its first number
+// in an array of all numbers of `Principled`.
 struct Field {
     const char* name;
     std::size_t first;

@@ -1,4 +1,4 @@
-// `Adapter::prepare` for each instruction set, chosen at run time: one binary serves all CPUs.
+// `Adapter::prepare` for each instruction set. The choice is made at run time, so one binary serves all CPUs.
 //
 // Each instruction set compiles the same code, kernels/body.inl, for its own vector type. avx512_bf16 alone runs the
 // network with its own code, which rounds weights and activations to bfloat16. Some compilers fail on that code (clang

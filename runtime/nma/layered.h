@@ -68,7 +68,7 @@ namespace detail {
 inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)); }
 // `w` moved slightly above the horizon, where visible normals are undefined.
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
-// How wide the event of a density is. `unscattered` weighs its connections by it.
+// The inverse of a density, which is large for a wide lobe. `unscattered` weighs its connections by it.
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
 // The reflectance of the conductor, per colour channel.
