@@ -135,7 +135,7 @@ def test_nma_render_needs_a_material_for_the_adapter_of_a_class(nma, tmp_path):
     random_adapter(hidden="1x8").save(tmp_path / "class.safetensors")
     code, _, err = nma("render", tmp_path / "class.safetensors", "-o", tmp_path / "no.exr")
     assert code == 1
-    assert "adapter of the whole class layered3; name a material: nma render MATERIAL --adapter" in err
+    assert "adapter of the whole class layered3; name a material, too: nma render MATERIAL --adapter" in err
 
 
 @pytest.mark.slow
