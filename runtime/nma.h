@@ -6,9 +6,10 @@
 //     const nma::Value v = brdf.eval_pdf(wi, wo);                        // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = brdf.sample(wi, u_lobe, u1, u2);
 //
-// C++17, no dependencies. The network runs on the widest vectors of the CPU (`InstructionSet`). Loading an adapter and
-// making `Curves` allocate memory and throw `nma::Error`. Everything else does neither, and many threads may call it at
-// once. Directions are unit vectors in the local frame, z up: `wi` points towards the viewer, `wo` towards the light.
+// C++17, no dependencies. The network runs on the widest vectors of the CPU (`InstructionSet`). Two functions allocate
+// memory and may throw `nma::Error`: loading an adapter, and making `Curves`. All others do neither, and many threads
+// may call them at once. Directions are unit vectors in the local frame, z up: `wi` points towards the viewer, `wo`
+// towards the light.
 //
 // Where things are, in the order in which a query meets them:
 //

@@ -15,7 +15,7 @@ struct Preparation {
     NetworkView network;
     Ranges ranges;
     int instances, outputs;  // counts
-    bool bounded;            // whether the blend may reflect no more light than it receives
+    bool bounded;            // whether the blend must not reflect more light than it receives
     // For each lane of each field of each pack: the index of its number among the decoded outputs. The order is that of
     // `Pack` in memory. A lane without a number has the index of an output of padding, whose value is 0.
     const int* lanes;

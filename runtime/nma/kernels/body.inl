@@ -1,6 +1,6 @@
 // The kernels in terms of a vector type. portable.h, neon.h, avx2.h and avx512.h each include this text inside their
-// own namespace, so it has no include guard and no namespace. It includes nothing. The including header has these
-// names:
+// own namespace, so it has no include guard and no namespace. It includes nothing. Before the
+// #include, a header defines these names:
 //
 //     NMA_FN        macro: the attributes of a function for this instruction set
 //     NMA_OP        macro: the same attributes, and the function is always inlined
