@@ -4,6 +4,7 @@ Each statistical test has the false-alarm rate `FALSE_ALARM` over all of its com
 """
 
 import numpy as np
+import pytest
 from scipy.stats import norm
 
 from nma.params import LAYERED3
@@ -38,6 +39,11 @@ CASES = {
     },
     "index_matched": {"alpha_top": 1e-4, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 1.0, "albedo": 0.7},
 }
+# For tests that walk long: three cases in every run, the others with the slow tests.
+SLOW_CASES = [
+    name if name in ("narrow_wide", "thick", "white_coated") else pytest.param(name, marks=pytest.mark.slow)
+    for name in CASES
+]
 
 
 def vector(values):

@@ -283,7 +283,7 @@ def shared_key(params, leaf):
     return key
 
 
-@pytest.mark.parametrize("kind", ("nma", "layered"))
+@pytest.mark.parametrize("kind", ("nma", pytest.param("layered", marks=pytest.mark.slow)))
 def test_edits_of_shared_textures_show_and_are_checked(adapter, kind):
     """A BSDF sees and checks edits of a shared texture, although Mitsuba notifies only the other object that has it."""
     shared = {"type": "ref", "id": "shared"}

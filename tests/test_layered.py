@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from layered_cases import CASES, GRID, limit, table_of, vector, z_scores
+from layered_cases import CASES, GRID, SLOW_CASES, limit, table_of, vector, z_scores
 
 from nma import ops
 from nma.jit import dr
@@ -77,7 +77,7 @@ def compare(values, seed, factor=1.0):
     return z_scores(*evaluated_table(values, 1 << 17, seed), walks, factor)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", SLOW_CASES)
 def test_evaluation_equals_walks(case):
     """Evaluation and walks agree in every bin that enough walks reach. Few walks reach bins far from a narrow lobe."""
     z = compare(CASES[case], seed=3)

@@ -165,7 +165,7 @@ def bent_more(params):
 
 
 @ESTIMATORS
-@pytest.mark.parametrize("case", layered_cases.CASES)
+@pytest.mark.parametrize("case", layered_cases.SLOW_CASES)
 def test_every_bin_is_that_of_the_package(bridge, case, estimator):
     """Walks and estimates in C++ have the same means as walks of the package, in bins and in sums of bins.
 

@@ -172,6 +172,7 @@ def test_a_blend_is_the_weighted_sum_of_its_instances():
     )
 
 
+@pytest.mark.slow
 def test_ten_million_evaluations_are_finite_and_not_negative():
     """`eval_pdf` and `sample` return finite values of at least 0 in single precision.
 
