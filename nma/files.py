@@ -1,4 +1,4 @@
-"""Writing files: whole or not at all, and tried before long work begins."""
+"""Writes files completely or not at all, and tests before long work whether a file can be written."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from nma.errors import NmaError, OutputError
 
-# What a trial writes: a full disk gives a name to a file, and refuses its bytes.
+# The bytes of a test file. They are needed because a full disk still creates files, and fails only at their bytes.
 _TRIAL = bytes(1 << 16)
 _ADVICE = {
     errno.ENOSPC: "free some space, or choose another place",
@@ -24,13 +24,13 @@ _ADVICE = {
 
 @contextmanager
 def whole(path: str | Path) -> Iterator[Path]:
-    """A file to be filled, which takes the place of `path` once the block has ended; if it fails, nothing is left.
+    """Gives the `with` block a temporary file, which replaces `path` when the block ends and is deleted if it fails.
 
         with whole("gold.npz") as file:
             np.savez(file, ...)
 
-    The name ends as that of `path` does. Folders on the way are made. Raises `OutputError` where the file cannot be
-    written.
+    The temporary file has the same suffix as `path`. Missing folders are made. Raises `OutputError` if the file cannot
+    be written.
     """
     path = Path(path)
     partial = _partial(path)
@@ -48,9 +48,9 @@ def whole(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to be filled, which becomes `path` once the block has ended; if it fails, nothing is left.
+    """Gives the `with` block a temporary folder, which becomes `path` when the block ends and is deleted if it fails.
 
-    Where another process makes the same folder and is faster, its folder stays.
+    If another process has made the same folder in the meantime, that folder stays.
     """
     partial = _partial(path)
     try:
@@ -68,34 +68,35 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Writes a whole file, as `whole`."""
+    """Writes bytes to a file, completely or not at all, as `whole` does."""
     with whole(path) as file:
         file.write_bytes(content)
 
 
 def write_text(path: str | Path, content: str) -> None:
-    """The same for text, as UTF-8."""
+    """Writes text to a file as UTF-8, completely or not at all, as `whole` does."""
     write_bytes(path, content.encode())
 
 
 @contextmanager
 def arrays(path: str | Path) -> Iterator[Any]:
-    """The arrays of an .npz file, by name. What is none is a `ValueError`, where NumPy would advise to unpickle it."""
+    """The arrays of an .npz file, by name. Raises `ValueError` for other files; NumPy would suggest to unpickle
+    them."""
     import numpy as np
 
     with Path(path).open("rb") as file:
         if file.read(2) != b"PK":
-            raise ValueError("it is no .npz file")
+            raise ValueError("it is not an .npz file")
         file.seek(0)
         with np.load(file) as found:
             yield found
 
 
 def try_file(*paths: str | Path) -> None:
-    """Makes sure that files can be written, so that hours of work do not end in nothing; leaves no trace.
+    """Tests whether files can be written, so that hours of work are not lost at the end. It leaves nothing behind.
 
-    Raises `OutputError` for a folder or a device in a file's place, a file in a folder's place, a name that is too
-    long, and a disk that is full or must not be written to.
+    Raises `OutputError` if a folder or a device has the name of a file, if a file has the name of a folder, if a name
+    is too long, or if the disk is full or read-only.
     """
     for path in map(Path, paths):
         try:
@@ -106,7 +107,7 @@ def try_file(*paths: str | Path) -> None:
 
 
 def try_folder(path: str | Path) -> None:
-    """The same for a folder that files will be written to, which need not exist."""
+    """Tests whether files can be written to a folder, which need not exist yet. Raises `OutputError`, as `try_file`."""
     path = Path(path)
     try:
         _try_folder(path)
@@ -115,13 +116,13 @@ def try_folder(path: str | Path) -> None:
 
 
 def _try_folder(folder: Path, *names: str) -> None:
-    """Writes a file to the folder or, as folders must not stay behind either, to the nearest one that exists."""
+    """Writes a test file to the folder, or to its nearest existing parent, because no new folder may be left behind."""
     missing = list(names)
     while not os.path.lexists(folder):
         missing.append(folder.name)
         folder = folder.parent
     for name in missing:
-        # Names that are too long are so in any folder.
+        # A name that is too long fails in every folder.
         with suppress(FileNotFoundError):
             os.lstat(folder / name)
     trial = _partial(folder / "trial")
@@ -133,7 +134,7 @@ def _try_folder(folder: Path, *names: str) -> None:
 
 
 def _check_place(path: Path) -> None:
-    """Refuses to replace what is no file: folders, devices, pipes."""
+    """Raises an error if `path` is a folder, a device or a pipe, which must not be replaced."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "a folder has this name")
     if path.exists() and not path.is_file():
@@ -141,7 +142,7 @@ def _check_place(path: Path) -> None:
 
 
 def _partial(path: Path) -> Path:
-    """A name beside the file, of its kind, that nobody else uses and that is short enough."""
+    """A short, unique name for a temporary file in the folder of `path`, with the suffix of `path`."""
     return path.with_name(f".nma-{secrets.token_hex(6)}.partial{path.suffix}")
 
 
@@ -149,7 +150,7 @@ def _refused(path: Path, error: OSError) -> NmaError:
     if isinstance(error, NmaError):
         return error
     reason = (
-        "there is a file where a folder is wanted"
+        "there is a file where a folder is needed"
         if isinstance(error, NotADirectoryError)
         else error.strerror
     )

@@ -1,4 +1,4 @@
-"""Parameters of source materials: one declaration per class drives sampling, inputs, textures, options and exports."""
+"""Declares the parameters of each class of materials. Sampling, inputs, textures, options and exports all use them."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _ADVICE = {
 
 
 class Bounds(NamedTuple):
-    """The numbers from `low` to `high`. Every check of a parameter asks `bad`, and says what `refusal` returns.
+    """The range from `low` to `high`. Every check of a parameter calls `bad`, and reports the message of `refusal`.
 
-    Numbers are arrays of NumPy or Dr.Jit. The bounds may be arrays, too, one number per column.
+    Methods take NumPy or Dr.Jit arrays. `low` and `high` may also be arrays, with one number per column.
     """
 
     low: Any
     high: Any
 
     def bad(self, x: Any, clamp: bool = False) -> Any:
-        """Which numbers are refused: those beyond by more than `ROUNDING`; with `clamp` only NaN and infinity."""
+        """Which numbers are out of range by more than `ROUNDING` or not finite; with `clamp`, which are not finite."""
         finite = abs(x) < np.inf
         if clamp:
             return ~finite
@@ -44,7 +44,7 @@ class Bounds(NamedTuple):
         return ~(finite & (x >= self.low - slack) & (x <= self.high + slack))
 
     def moved(self, x: Any) -> Any:
-        """The nearest numbers within the bounds; for NaN the lower bound. On a bound the derivative is 1, not 0."""
+        """The nearest numbers within the bounds, and the lower bound for NaN. The derivative on a bound is 1, not 0."""
         return ops.select(x >= self.low, ops.select(x <= self.high, x, self.high), self.low)
 
     def refusal(self, name: str, found: ArrayLike, kind: Range = "valid") -> str:
@@ -58,9 +58,9 @@ class Bounds(NamedTuple):
 class Param:
     """One parameter of a class: a number (size 1) or an RGB triple (size 3).
 
-    `law` says how training draws it: uniformly, as 10 to a uniform power, as 1 - U^2, or "conductor", the mixture of
-    real metals and uniform draws that CONVENTIONS.md describes. `low`..`high` is the training range, `valid_low`..
-    `valid_high` what is physically meaningful; sources accept the latter, adapters only the former.
+    `law` says how training draws the parameter: "uniform"; "log10", as 10 to a uniform power; "one_minus_square", as 1
+    - U^2; or "conductor", the mixture of real metals and uniform draws described in CONVENTIONS.md. Adapters accept the
+    training range, `low` to `high`. Sources accept the physically meaningful range, `valid_low` to `valid_high`.
     """
 
     name: str
@@ -74,14 +74,14 @@ class Param:
     size: int = 1
 
     def normalise(self, x):
-        """Maps the training range to [0, 1]: linearly, or by the logarithm where the law is logarithmic."""
+        """Maps the training range to [0, 1]: linearly, or logarithmically if the law is "log10"."""
         if self.law == "log10":
             span = np.log(self.high / self.low)
             return ops.log(x / self.low) * float(1.0 / span)
         return (x - self.low) / (self.high - self.low)
 
     def draw(self, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-        """(n, size) values drawn by the law, a conductor's channels uniformly."""
+        """Random values (n, size), drawn by the law. The channels of a conductor are drawn uniformly."""
         u = rng.random((n, self.size))
         if self.law == "log10":
             return 10.0 ** (np.log10(self.low) + u * np.log10(self.high / self.low))
@@ -95,7 +95,7 @@ class Param:
 
 @dataclass(frozen=True)
 class ParamSpace:
-    """The parameters of a class, in the order of its vectors' columns."""
+    """The parameters of a class, in the order of the columns of a parameter vector."""
 
     name: str
     params: tuple[Param, ...]
@@ -107,7 +107,7 @@ class ParamSpace:
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Where each parameter lies in a vector."""
+        """The columns of each parameter in a parameter vector."""
         ends = np.cumsum([p.size for p in self.params])
         return {p.name: slice(int(e) - p.size, int(e)) for p, e in zip(self.params, ends, strict=True)}
 
@@ -120,7 +120,7 @@ class ParamSpace:
         )
 
     def vector(self, values: dict[str, ArrayLike]) -> NDArray[np.float64]:
-        """A vector (size,) from named values; a number given for an RGB parameter means grey."""
+        """The parameter vector (size,) of named values. A single number for an RGB parameter means grey."""
         unknown = set(values) - {p.name for p in self.params}
         missing = [p.name for p in self.params if p.name not in values]
         if unknown or missing:
@@ -145,10 +145,11 @@ class ParamSpace:
         return out
 
     def check(self, params: ArrayLike, bounds: Range = "valid", clamp: bool = False) -> NDArray[np.float64]:
-        """Returns `params` as float64 (n, size) within the bounds, or raises `ParamError` that names the first fault.
+        """Returns `params` as float64 (n, size) within the bounds. Raises `ParamError`, which names the first bad
+        value.
 
-        Values beyond a bound by no more than a rounding error are moved to it; with `clamp` all are, but what is not
-        finite is refused all the same.
+        Values that exceed a bound by a rounding error are moved to the bound. With `clamp`, all values out of range are
+        moved. Values that are not finite are always refused.
         """
         p = np.atleast_2d(np.asarray(params, np.float64))
         if p.ndim != 2 or p.shape[1] != self.size:
@@ -165,19 +166,19 @@ class ParamSpace:
         return Bounds(*self.columns(bounds)).moved(p)
 
     def columns(self, bounds: Range) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper bound of every column."""
+        """The lower and the upper bound of each column."""
         pairs = np.array([p.bounds(bounds) for p in self.params for _ in range(p.size)]).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 
     def sample(
         self, rng: np.random.Generator, n: int, population: Population = "mixed"
     ) -> NDArray[np.float64]:
-        """(n, size) parameter vectors drawn by each parameter's law.
+        """Random parameter vectors (n, size), drawn by the law of each parameter.
 
-        For classes with a conductor, `population` chooses where (eta, k) come from: "range" draws every channel
-        uniformly, "metals" takes real metals other than those held out, "held_out_metals" takes those, "mixed", what
-        training uses, takes half of each of the first two, and "unseen_metals", for tests, takes every third
-        material's from the metals held out.
+        For classes with a conductor, `population` chooses the source of (eta, k). "range" draws every channel
+        uniformly. "metals" takes real metals, except those held out for tests. "held_out_metals" takes only the metals
+        held out. "mixed", for training, takes "range" or "metals" with equal probability. "unseen_metals", for tests,
+        takes every third material from the metals held out and the others from the other metals.
         """
         if population not in get_args(Population):
             raise ParamError(
@@ -198,8 +199,9 @@ class ParamSpace:
         return out
 
 
-# Where sources end, though nature does not: beyond, Fresnel's terms overflow in single precision, and walks through a
-# white medium take the square of its depth in steps, which looks like hanging.
+# The largest values that sources accept. With a larger index, Fresnel terms overflow in single precision. With a deeper
+# medium, a walk through a white medium needs about the square of the depth in steps, and the program would seem to
+# hang.
 _MAX_INDEX, _MAX_DEPTH = 1e4, 1e3
 
 LAYERED3 = ParamSpace(
@@ -254,10 +256,10 @@ LAYERED3 = ParamSpace(
     ),
 )
 
-# A single material, of which nothing is known but its values: measured, tabulated, or somebody else's BSDF.
+# A single material that has only values and no parameters: measured, tabulated, or a BSDF of another program.
 MEASURED = ParamSpace("measured", ())
 
-# A material of a library (`nma.adapter.library`) by its learned code, whose numbers mean nothing one by one.
+# A material of a library (`nma.adapter.library`), given by its learned code. A single number of a code has no meaning.
 CODE_BOUND = 4.0
 LIBRARY = ParamSpace(
     "library",

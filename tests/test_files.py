@@ -30,7 +30,7 @@ def places(tmp_path) -> dict[str, Path]:
     (tmp_path / "file").write_text("mine")
     return {
         "a folder has this name": tmp_path / "folder.npz",
-        "a file where a folder is wanted": tmp_path / "file" / "sub" / "a.npz",
+        "a file where a folder is needed": tmp_path / "file" / "sub" / "a.npz",
         "name too long": tmp_path / ("n" * 300 + ".npz"),
         "too long": tmp_path / ("n" * 300) / "a.npz",
         "no ordinary file": Path(os.devnull),
@@ -55,7 +55,7 @@ def test_a_trial_leaves_no_trace(tmp_path):
     (tmp_path / "b.npz").write_text("old")
     try_file(tmp_path / "b.npz")
     assert (tmp_path / "b.npz").read_text() == "old"
-    with pytest.raises(OutputError, match="a file where a folder is wanted"):
+    with pytest.raises(OutputError, match="a file where a folder is needed"):
         try_folder(tmp_path / "b.npz")
 
 

@@ -118,7 +118,7 @@ def test_an_image_without_colour_channels_is_refused_with_the_names_of_its_chann
     texture = materials.load(material_file("sigma_t = 0.25", "sigma_t = { texture = 'other.exr' }")).values[
         "sigma_t"
     ]
-    with pytest.raises(TextureError, match="channels Z, ID; wanted are R, G, B"):
+    with pytest.raises(TextureError, match="channels Z, ID; it needs R, G, B"):
         texture.read()
 
 

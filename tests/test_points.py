@@ -143,11 +143,11 @@ def _quarter(w):
 
 
 def test_recipes_and_sources_must_agree_on_isotropy():
-    with pytest.raises(NmaError, match="BSDF 'roughconductor' is anisotropic; take a recipe for such"):
+    with pytest.raises(NmaError, match="BSDF 'roughconductor' is anisotropic; take a recipe whose target"):
         fit(from_dict(BRUSHED), QUICK, {})
-    with pytest.raises(NmaError, match="the table is isotropic; take a recipe for such"):
+    with pytest.raises(NmaError, match="the table is isotropic; take a recipe whose target"):
         fit(tabulate_values(LAMBERT, grid=SMALL), recipes.ANISOTROPIC)
-    with pytest.raises(NmaError, match="formula has values without noise, which the loss 'log' is for"):
+    with pytest.raises(NmaError, match="formula has values without noise; they need the loss 'log'"):
         fit(LAMBERT, replace(QUICK, loss="huber"))
     with pytest.raises(NmaError, match="an anisotropic target needs anisotropic tables"):
         replace(recipes.MEASURED, target="anisotropic")

@@ -33,12 +33,12 @@ from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
-# Parameters that differ by less, relative to their size, are of the same material: rounding to single precision.
+# Parameters with a smaller relative difference are of the same material: they differ by rounding to single precision.
 SAME = 1e-5
 
 
 def shipped() -> tuple[str, ...]:
-    """Names of the adapters that come with the package."""
+    """The names of the adapters that come with the package."""
     return tuple(
         sorted(
             p.name.removesuffix(".safetensors") for p in _SHIPPED.iterdir() if p.name.endswith(".safetensors")
@@ -47,7 +47,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def weights_file(name_or_path: str | Path) -> Path:
-    """The file of a shipped adapter's name, or the path as it is."""
+    """The file of the shipped adapter with this name; for any other name, the name as a path."""
     if str(name_or_path) in shipped():
         return Path(str(_SHIPPED.joinpath(f"{name_or_path}.safetensors")))
     return Path(name_or_path)
@@ -55,7 +55,7 @@ def weights_file(name_or_path: str | Path) -> Path:
 
 @dataclass(frozen=True)
 class Adapter:
-    """A trained network with all that belongs to it. `Adapter.load` reads one, `prepare` applies it.
+    """A trained network, with everything that is needed to apply it. `Adapter.load` reads a file; `prepare` applies it.
 
     With `bounded`, blends are dimmed where they might reflect more light than they receive (`nma.target.bounded`).
     """
@@ -71,7 +71,7 @@ class Adapter:
 
     @staticmethod
     def load(name_or_path: str | Path) -> Adapter:
-        """A shipped adapter by name, or one from a weights file. Raises `WeightsError`."""
+        """Loads a shipped adapter by its name, or an adapter from a weights file. Raises `WeightsError`."""
         path = weights_file(name_or_path)
         if path.suffix != ".safetensors" and not os.path.exists(path):
             raise WeightsError(
@@ -97,7 +97,7 @@ class Adapter:
         return adapter
 
     def save(self, path: str | Path, more: Mapping[str, NDArray] | None = None) -> None:
-        """Writes a weights file, atomically, with `more` tensors than the network's where there are such."""
+        """Writes a weights file, atomically. `more` are further tensors to store with the network's."""
         header = weights.Header(
             class_name=self.space.name,
             parameters=weights.describe(self.space),
@@ -122,17 +122,17 @@ class Adapter:
 
     @property
     def reciprocal(self) -> bool:
-        """Whether swapping wi and wo leaves f as it is: where nothing depends on wi but the lobes themselves."""
+        """Whether swapping wi and wo does not change f. This holds if the target's parameters do not depend on wi."""
         return not (self.directional or self.bounded)
 
     @property
     def size(self) -> int:
-        """How many numbers describe the target: 23 for the paper's blend of two."""
+        """How many numbers describe the target: 23 for the paper's blend of two instances."""
         return output_size(self.instances, self.target)
 
     @property
     def anisotropic(self) -> bool:
-        """Whether the material looks different when it is turned about its normal."""
+        """Whether the adapter depends on the azimuth of the view direction."""
         return self.encoding in encoding.ANISOTROPIC
 
     @property
@@ -142,9 +142,9 @@ class Adapter:
 
     @property
     def material(self) -> NDArray[np.float64] | None:
-        """The parameters of the only material that the adapter knows, in the order of its class.
+        """The parameters of the only material for which the adapter was trained, in the order of its class.
 
-        None where it knows the whole class, or where the class has no parameters to tell materials by.
+        It is None if the adapter was trained for a whole class, or if its class has no parameters.
         """
         fitted = self.training.get("params")
         if not self.space.size or self.encoding not in encoding.SINGLE or fitted is None:
@@ -152,10 +152,10 @@ class Adapter:
         return np.asarray(fitted, np.float64)
 
     def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
-        """Returns `params` as float64 (n, columns), if the adapter knows such materials.
+        """Returns `params` as float64 (n, columns) if the adapter was trained for these materials.
 
-        That of a class knows its training range, to which `clamp` moves them; that of a single material knows that one.
-        Raises `ParamError` for others.
+        An adapter of a class accepts parameters within the training range, and with `clamp` moves others to that range.
+        An adapter of a single material accepts only the parameters of this material. Raises `ParamError` for others.
         """
         known = self.material
         if known is None:
@@ -174,10 +174,9 @@ class Adapter:
         return given
 
     def prepare(self, columns: Sequence[Float], wi: Vec3, active: Any = True) -> Brdf:
-        """The material's BRDF seen from `wi`, for one array per parameter column, on Dr.Jit or NumPy (n,).
+        """The material's BRDF seen from `wi`. `columns` has one Dr.Jit or NumPy array (n,) per column of the class.
 
-        `wi` is a unit vector of the local frame. Of Dr.Jit's lanes those that are not `active` get a BRDF without a
-        meaning.
+        `wi` is a unit vector of the local frame. Dr.Jit lanes that are not `active` get a meaningless BRDF.
         """
         inputs = encoding.get(self.encoding)(columns, wi if self.directional else None)
         if ops.backend(*columns, wi.z) == "drjit":
@@ -188,11 +187,11 @@ class Adapter:
         return self.decode(raw, wi)
 
     def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF that the network's outputs mean, seen from `wi`."""
+        """The BRDF that the network's raw outputs describe, seen from `wi`."""
         return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
 
     def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF of what `numbers` returns, one array for each of them, seen from `wi`."""
+        """The BRDF, seen from `wi`, of the numbers that `numbers` returns; `flat` has one array for each number."""
         return self._framed(from_numbers(flat, self.target), wi)
 
     def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
@@ -202,7 +201,7 @@ class Adapter:
     def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
         """Target parameters (m, n, size) of m materials (m, columns) at n cosines (n,): curves over cos(theta_i).
 
-        Raises `ParamError` if the azimuth of the view matters, too.
+        Raises `ParamError` for anisotropic adapters.
         """
         self.check_isotropic()
         p = np.atleast_2d(np.asarray(params, np.float64))
@@ -213,7 +212,7 @@ class Adapter:
         return np.stack(lanes, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
 
     def check_isotropic(self) -> None:
-        """Raises `ParamError` if cos(theta_i) does not say all about the view direction."""
+        """Raises `ParamError` if the adapter needs more of the view direction than cos(theta_i)."""
         if self.anisotropic:
             raise ParamError(
                 "an anisotropic adapter has no curves over cos(theta_i), as the azimuth of the view matters; "
@@ -221,7 +220,7 @@ class Adapter:
             )
 
     def _check(self, path: Path, dialect: str) -> None:
-        """Refuses a network that does not fit its own description, or this version's target."""
+        """Raises `WeightsError` for a network that does not fit its description or this version's target."""
         self._check_material(path)
         if dialect != DIALECT:
             raise WeightsError(
@@ -247,7 +246,7 @@ class Adapter:
             )
 
     def _check_material(self, path: Path) -> None:
-        """Refuses a record of the only material known that is none of the class."""
+        """Raises `WeightsError` if the recorded parameters of the only material are not valid for the class."""
         try:
             known = self.material
             if known is not None and self.space.check(known).shape[1:] != known.shape:

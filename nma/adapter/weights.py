@@ -1,8 +1,8 @@
-"""The weights file: safetensors, with everything needed to use the network as JSON in its header.
+"""Reads and writes weights files: safetensors files, whose header has all settings of the network as JSON.
 
-Tensors `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight`, ... float32; a library
-(`nma.adapter.library`) has one more. The header's metadata has one entry, `nma`, a JSON object with the
-fields of `Header`.
+The tensors are float32: `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight` and so on. A library
+(`nma.adapter.library`) also has its codes. The header's metadata has one entry, `nma`: a JSON object with the fields of
+`Header`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from nma.network import Layers
 from nma.params import SPACES, ParamSpace
 
 FORMAT = 1
-# Brackets within brackets of the metadata; those of files that were trained nest 4 deep.
+# The deepest nesting of brackets that is read in the metadata. Files of trained adapters nest 4 deep.
 MAX_DEPTH = 32
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a weights file says about itself.
+    """The metadata of a weights file.
 
-    `parameters` repeats the class's declaration, so that other languages need no Python. `reciprocal` holds for
-    adapters whose target does not depend on the view direction. `target` lists the target's numbers with their ranges,
-    `dialect` names the Principled BRDF meant, and `bounded` says whether it is dimmed where it might reflect more light
-    than it receives. `training` is the record of how the weights came to be.
+    `parameters` repeats the declaration of the class, so that programs in other languages need no Python. `reciprocal`
+    is true if the target does not depend on the view direction. `target` lists the target's parameters with their
+    ranges. `dialect` names the version of the Principled BRDF. `bounded` says whether the target is dimmed where it
+    might reflect more light than it receives. `training` records how the weights were made.
     """
 
     class_name: str
@@ -54,7 +54,7 @@ class Header:
 
 
 def describe(space: ParamSpace) -> list[dict[str, Any]]:
-    """A class's declaration as JSON data; infinite bounds become null."""
+    """The declaration of a class as JSON data; infinite bounds become null."""
     rows = [asdict(p) for p in space.params]
     return [{k: None if v in (float("inf"), float("-inf")) else v for k, v in row.items()} for row in rows]
 
@@ -62,7 +62,7 @@ def describe(space: ParamSpace) -> list[dict[str, Any]]:
 def write(
     path: str | Path, header: Header, layers: Layers, more: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Writes the file atomically, with `more` tensors than the layers where there are such."""
+    """Writes a weights file, atomically. `more` are further tensors to store with the layers."""
     tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in (more or {}).items()}
     for number, (matrix, bias) in enumerate(layers):
         tensors[f"layer{number}.weight"] = np.ascontiguousarray(matrix, np.float32)
@@ -71,7 +71,7 @@ def write(
 
 
 def read(path: str | Path) -> tuple[Header, Layers]:
-    """Header and layers of a weights file; `WeightsError` says what is wrong with it."""
+    """The header and the layers of a weights file. Raises `WeightsError`, which says what is wrong with the file."""
     path = Path(path)
     if not os.path.isfile(path):
         raise WeightsError(f"{path}: no such weights file; `nma train` or `nma fit` writes one")
@@ -93,7 +93,7 @@ def read(path: str | Path) -> tuple[Header, Layers]:
 
 
 def _check_types(path: Path, types: Mapping[str, str]) -> None:
-    """Refuses tensors of other numbers than those that are written."""
+    """Raises `WeightsError` for tensors that are not float32."""
     for name, kind in types.items():
         if kind != "F32":
             raise WeightsError(
@@ -102,7 +102,7 @@ def _check_types(path: Path, types: Mapping[str, str]) -> None:
 
 
 def _header(path: Path, text: str) -> Header:
-    """The header from its JSON, every field of the type that it is declared with."""
+    """The header from its JSON text, after a check of the type of each field."""
     if _depth(text) > MAX_DEPTH:
         raise WeightsError(
             f"{path}: its metadata nests {_depth(text)} deep, at most {MAX_DEPTH} is read; copy or train it again"
@@ -122,7 +122,7 @@ def _header(path: Path, text: str) -> Header:
 
 
 def _depth(text: str) -> int:
-    """How deep the brackets of a JSON text nest, those within its strings aside."""
+    """How deep the brackets of a JSON text nest. Brackets in strings do not count."""
     depth = deepest = 0
     for token in re.findall(r'"(?:[^"\\]|\\.)*"|[\[{\]}]', text, re.DOTALL):
         depth += (token in "[{") - (token in "]}")
@@ -131,7 +131,7 @@ def _depth(text: str) -> int:
 
 
 def _check_class(path: Path, header: Header) -> None:
-    """Refuses formats and classes that this version does not know, or knows differently."""
+    """Raises `WeightsError` for a format or class that this version does not have, or that it declares differently."""
     if header.format != FORMAT:
         raise WeightsError(
             f"{path}: format {header.format}, this version reads {FORMAT}; upgrade the package"

@@ -1,4 +1,4 @@
-"""The adapter's own tables, and how they compare with references."""
+"""Makes tables of adapters, and compares them with reference tables."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from nma.jit import dr
 from nma.table import ISOTROPIC, Grid, Tables, quadrature
 from nma.table.walks import bin_index
 
-# The network runs at this many cos(theta_i) in each row of the table. For each of them the target is evaluated at this
-# many wo in each bin, and at this many wo drawn from its own lobes.
+# The network runs at _DIRECTIONS values of cos(theta_i) in each row of the table. At each of them the target is
+# evaluated at _POINTS directions wo in each bin, and at _SAMPLES directions wo drawn from its own lobes.
 _DIRECTIONS = 32
 _POINTS = 4
 _SAMPLES = 512
-# Where the target's density far exceeds this [1/sr], its lobes are too sharp for points in a bin: its samples count.
+# Where the target's density is far above this [1/sr], a lobe is too sharp for points in a bin, and samples are used.
 _SHARP = 10.0
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures per material and their means.
+    """The error figures of each material, and their means.
 
-    `integration_error` and `albedo_integration_error` say how exact the adapter's own bin averages are, in log loss and
-    in albedo, from two independent estimates; `estimated_error` whether the references came without standard errors.
+    `integration_error` and `albedo_integration_error` estimate the error of the adapter's own bin averages, in log loss
+    and in albedo, from two independent estimates. `estimated_error` is true if the references have no standard errors
+    of their own.
     """
 
     materials: list[dict[str, float]]
@@ -50,10 +51,10 @@ def tabulate_adapter(
     grid: Grid = ISOTROPIC,
     directions: int | None = None,
 ) -> NDArray[np.float32]:
-    """The adapter's bin averages (n, theta_i, theta_o, phi, 3). `shift` in [0, 1) selects another set of points.
+    """The adapter's bin averages (n, theta_i, theta_o, phi, 3). Each `shift` in [0, 1) gives a different set of points.
 
-    With fewer `directions`, the cos(theta_i) in each row (32), it is faster and less exact in proportion.
-    Raises `ParamError` for parameters outside of the training range, or moves them to it with `clamp`.
+    `directions` is the number of cos(theta_i) per row (32 by default): the time and the precision are in proportion to
+    it. Raises `ParamError` for parameters outside the training range; with `clamp`, moves them to the range.
     """
     if adapter.anisotropic:
         raise TableError(
@@ -67,7 +68,7 @@ def tabulate_adapter(
 
 
 def table_log_loss(adapter: Adapter, params: NDArray, table: NDArray, directions: int | None = None) -> float:
-    """The log loss (eq. 7) of one material (columns,) against its table, integrated once: quicker than `evaluate`."""
+    """The log loss (eq. 7) of one material (columns,) against its table; integrated once, so faster than `evaluate`."""
     own = tabulate_adapter(adapter, params[None], directions=directions)[0]
     return metrics.table_metrics(own, table, np.zeros_like(own))["log_loss"]
 
@@ -75,10 +76,10 @@ def table_log_loss(adapter: Adapter, params: NDArray, table: NDArray, directions
 def _tabulate(
     numbers: NDArray, mu: NDArray, shift: float, adapter: Adapter, grid: Grid
 ) -> NDArray[np.float32]:
-    """One material's table from its target parameters (theta_i * directions, size) at the cosines `mu`.
+    """The table of one material, from its target parameters (theta_i * directions, size) at the cosines `mu`.
 
-    f cos(theta_o) is split by a smooth function of its own density into a sharp part, which the target's samples find
-    whatever its width, and the rest, which points in every bin resolve.
+    f cos(theta_o) is split into a sharp and a smooth part, by a function of the target's density. Samples of the target
+    integrate the sharp part, whatever its width. Points in every bin integrate the smooth part.
     """
     curves = [dr.auto.Float(np.ascontiguousarray(c)) for c in numbers.T]
     cosines, seed = dr.auto.Float(mu), dr.opaque(dr.auto.UInt32, int(shift * 2**24))
@@ -91,7 +92,7 @@ def _tabulate(
 def _by_points(
     curves: list[Any], cosines: Any, seed: Any, adapter: Adapter, grid: Grid
 ) -> NDArray[np.float64]:
-    """The part that is not sharp (bins, 3), averaged over points in every bin."""
+    """The smooth part (bins, 3), averaged over points in every bin."""
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     directions = len(cosines) // grid.theta_i
     bins = dr.arange(UInt32, grid.bins)
@@ -138,13 +139,13 @@ def _by_samples(
     directions = len(cosines) // grid.theta_i
     index = bin_index(at // directions, UInt32(0), wo, grid)
     dr.eval(index, *value)
-    # Summed by NumPy, in a fixed order.
+    # NumPy adds the samples in a fixed order, so that results are reproducible.
     sums = [np.bincount(index.numpy(), c.numpy(), grid.bins) for c in value]
     return np.stack(sums, axis=-1) / (directions * _SAMPLES * grid.solid_angle)
 
 
 def _sharpness(pdf: Any) -> Any:
-    """Share of a value that belongs to the sharp part, 0 to 1, given its density."""
+    """The share, 0 to 1, of a value that belongs to the sharp part, given the target's density."""
     x = pdf * (1.0 / _SHARP)
     return 1.0 - 1.0 / (1.0 + x * x)
 
@@ -156,10 +157,10 @@ def evaluate(
     *,
     clamp: bool = False,
 ) -> Evaluation:
-    """Compares the adapter with reference tables over the paper's bins.
+    """Compares the adapter with reference tables over the paper's bins. `progress` gets the number of materials done.
 
-    Raises `TableError` for tables of other bins, and `ParamError` for materials that the adapter was not trained for,
-    unless `clamp` moves their parameters to the training range.
+    Raises `TableError` for tables of other bins, and `ParamError` for materials for which the adapter was not trained.
+    With `clamp`, parameters are moved to the training range instead.
     """
     if reference.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
@@ -174,7 +175,7 @@ def evaluate(
         mean = 0.5 * (halves[0] + halves[1])
         materials.append(metrics.table_metrics(mean, reference.values[n], _error(reference, n)))
         spread = metrics.table_metrics(halves[0], halves[1], np.zeros_like(mean))
-        # The mean of two estimates is off by half of their difference, on average.
+        # On average, the error of the mean of two estimates is half of their difference.
         spreads.append((0.5 * spread["log_loss"], 0.5 * spread["albedo_error"]))
         progress(n + 1)
     log_loss, albedo = np.mean(spreads, axis=0)
@@ -184,7 +185,7 @@ def evaluate(
 
 
 def _error(reference: Tables, n: int) -> NDArray:
-    """Standard error per bin of a reference, from counting statistics if it does not state any."""
+    """The standard error per bin of a reference. If the reference has none, counting statistics give it."""
     if reference.error is not None:
         return reference.error[n]
     walks = int(reference.walks[n])

@@ -26,10 +26,10 @@ __all__ = ["Material", "Texture", "load", "names"]
 FOLDER = Path(__file__).parent
 HEADER = ("title", "description", "class", "uv_scale", "parameters")
 TEXTURE_OPTIONS = ("texture", "raw", "channel", "scale", "offset", "uv_scale")
-# A material is a page of text; a larger file is something else.
+# A material's file is a page of text; larger files are refused.
 MAX_BYTES = 1 << 20
 
-_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # .05, which TOML does not take for a number
+_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # .05, which is not a number in TOML
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -38,7 +38,7 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 class Material:
     """A source material: `values` has a number, an RGB triple or a `Texture` for each parameter of its class.
 
-    Textures that `changed` adds lie `uv_scale` times along a unit of uv, unless they say otherwise.
+    Textures that `changed` adds repeat `uv_scale` times per unit of uv, unless they set their own `uv_scale`.
     """
 
     name: str
@@ -55,11 +55,11 @@ class Material:
 
     @property
     def textures(self) -> dict[str, Texture]:
-        """The parameters that an image drives."""
+        """The textures of the parameters that images drive, by parameter name."""
         return {name: value for name, value in self.values.items() if isinstance(value, Texture)}
 
     def vector(self) -> NDArray[np.float64]:
-        """The parameters (13,) in the order of the class; `MaterialError` if any is textured."""
+        """The parameter vector, (13,) for `layered3`. Raises `MaterialError` if a parameter has a texture."""
         if self.textures:
             raise MaterialError(
                 f"material '{self.name}' has no single parameter vector: "
@@ -70,7 +70,7 @@ class Material:
 
     @staticmethod
     def of_vector(name: str, vector: NDArray[np.float64], space: ParamSpace) -> Material:
-        """The material of a parameter vector, one row of those that `ParamSpace.sample` draws."""
+        """The material of a parameter vector (size,), such as a row that `ParamSpace.sample` returns."""
         values: dict[str, Any] = {
             param.name: float(vector[columns][0])
             if param.size == 1
@@ -80,25 +80,25 @@ class Material:
         return Material(name, name.replace("-", " ").capitalize(), "", space.name, values)
 
     def changed(self, given: Mapping[str, Any], where: str | Path = "changes") -> Material:
-        """A copy with some parameters replaced, given as in a file: numbers, lists, colours, `conductor`, textures.
+        """A copy with some parameters replaced. `given` has values as in a file: numbers, lists, colours, `conductor`,
+        textures.
 
-        Texture paths are relative to the folder of `where`, which errors name. Raises `MaterialError`.
+        Texture paths are relative to the folder of `where`; error messages begin with `where`. Raises `MaterialError`.
         """
         changed = _values(given, self.space, Path(where), self.uv_scale, partial=True)
         return replace(self, values=self.values | changed)
 
 
 def names() -> tuple[str, ...]:
-    """Names of the materials shipped with the package, sorted."""
+    """The sorted names of the materials that come with the package."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
 
 
 def load(name_or_path: str | Path) -> Material:
-    """A shipped material by its name, or one from a file (anything that ends in `.toml`).
+    """Loads a shipped material by its name, or a material from a file whose name ends in `.toml`.
 
-    Values may be anything physically valid; whether an adapter knows them is the adapter's to say. Texture
-    files must exist, they are read by `Texture.read`. Raises `MaterialError` that names the file and the
-    fault.
+    Values must be physically valid; an adapter checks later whether they are in its training range. Texture files must
+    exist, and `Texture.read` reads them. Raises `MaterialError`, which names the file and the fault.
     """
     if str(name_or_path).endswith(".toml"):
         path = Path(name_or_path)
@@ -155,7 +155,7 @@ def _parse(document: Mapping[str, Any], path: Path) -> Material:
 def _values(
     given: Mapping[str, Any], space: ParamSpace, path: Path, uv_scale: float, partial: bool = False
 ) -> dict[str, Any]:
-    """One checked value per parameter of the class, in its order; only those given if `partial`."""
+    """The checked value of each parameter, in the order of the class. With `partial`, parameters may be missing."""
     given = _with_indices(given, path)
     known = [param.name for param in space.params]
     _refuse_unknown(given, (*known, "conductor"), f"{path}, [parameters]")
@@ -163,7 +163,8 @@ def _values(
         raise MaterialError(f"{path}, [parameters]: {', '.join(missing)} missing")
     values = {p.name: _value(given[p.name], p, path, uv_scale) for p in space.params if p.name in given}
 
-    # Textures are checked when they are read; any allowed number stands in for them here, and for what is not given.
+    # Textures are checked when they are read. Here, an allowed number stands in for textures and for missing
+    # parameters.
     numbers: dict[str, Any] = {param.name: param.low for param in space.params}
     numbers |= {name: value for name, value in values.items() if not isinstance(value, Texture)}
     try:
@@ -174,7 +175,7 @@ def _values(
 
 
 def _with_indices(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Replaces `conductor` by the refractive index of that metal."""
+    """The values, with `conductor` replaced by the refractive index of that metal."""
     values = dict(given)
     if "conductor" not in values:
         return values
@@ -191,7 +192,10 @@ def _with_indices(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _value(given: Any, param: Param, path: Path, uv_scale: float) -> float | tuple[float, ...] | Texture:
-    """A number, a triple, a colour's hexadecimal digits, or a texture; a number for a triple means grey."""
+    """The value of a parameter from its TOML value: a number, a list, a hexadecimal colour, or a texture.
+
+    A single number for an RGB parameter means grey.
+    """
     if isinstance(given, Mapping):
         return _texture(given, param, path, uv_scale)
     if isinstance(given, str) and given.startswith("#"):
@@ -207,7 +211,7 @@ def _value(given: Any, param: Param, path: Path, uv_scale: float) -> float | tup
 
 
 def _colour(given: str, param: Param, path: Path) -> tuple[float, ...]:
-    """A colour of sRGB in hexadecimal digits, made linear."""
+    """The linear value of an sRGB colour in hexadecimal digits."""
     if not _is_colour(param):
         raise MaterialError(
             f"{path}: {param.name} is no colour, so {_shown(given)} means nothing; give numbers"
@@ -218,7 +222,7 @@ def _colour(given: str, param: Param, path: Path) -> tuple[float, ...]:
 
 
 def _is_colour(param: Param) -> bool:
-    """Whether the parameter is a share of light per channel, which people pick and paint in sRGB."""
+    """Whether the parameter is a reflectance or albedo per channel, which people pick and paint in sRGB."""
     return param.size == 3 and param.bounds("valid") == (0.0, 1.0)
 
 
@@ -235,13 +239,13 @@ def _texture(given: Mapping[str, Any], param: Param, path: Path, uv_scale: float
     image = path.parent / given["texture"]
     if not os.path.isfile(image):
         raise MaterialError(f"{where}: there is no texture {_short(image)}")
-    # Colours are painted in sRGB, everything else is a number.
+    # By default, images of colours are sRGB and all other images are raw numbers.
     raw, channel = given.get("raw", not _is_colour(param)), _channel(given, param, where)
     return Texture(param, image.resolve(), raw, scale, offset, channel, _uv_scale(given, uv_scale, where))
 
 
 def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
-    """The channel that is chosen for a parameter of one number."""
+    """The channel chosen for a parameter of one number; None if none is chosen."""
     channel = given.get("channel")
     if channel is None:
         return None
@@ -255,7 +259,7 @@ def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
 
 
 def _uv_scale(given: Mapping[str, Any], default: float, where: str) -> float:
-    """How often images lie along a unit of uv."""
+    """How often images repeat per unit of uv."""
     uv_scale = _option(given, "uv_scale", default, where)
     if not uv_scale > 0:
         raise MaterialError(f"{where}: uv_scale is {uv_scale:g}, but must be above 0")
@@ -263,7 +267,7 @@ def _uv_scale(given: Mapping[str, Any], default: float, where: str) -> float:
 
 
 def _option(given: Mapping[str, Any], key: str, default: float, where: str) -> float:
-    """A number of single precision."""
+    """The finite number given for an option, or its default."""
     value = given.get(key, default)
     if not (_is_number(value) and abs(_float(value)) < 1e38):
         raise MaterialError(f"{where}: {key} is {_shown(value)}, but must be a finite number")
@@ -275,7 +279,7 @@ def _is_number(x: Any) -> bool:
 
 
 def _float(x: float) -> float:
-    """The number as a float; integers have no bound in TOML."""
+    """The number as a float. TOML's integers may be too large for a float; they become infinite."""
     try:
         return float(x)
     except OverflowError:
@@ -283,7 +287,7 @@ def _float(x: float) -> float:
 
 
 def _shown(given: Any) -> str:
-    """A value of a file in an error: short, on one line."""
+    """A value of a file as text for an error message: short, on one line."""
     try:
         return _REPR.repr(given)
     except ValueError:
@@ -291,7 +295,7 @@ def _shown(given: Any) -> str:
 
 
 def _short(name: object) -> str:
-    """A name in an error: short, on one line."""
+    """A name as text for an error message: short, on one line."""
     text = repr(str(name))[1:-1]
     return text if len(text) <= 300 else f"{text[:100]}..."
 

@@ -1,4 +1,4 @@
-"""Images that drive parameters of materials."""
+"""Reads images that drive parameters of materials."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nma.errors import TextureError, either, one_line
 from nma.images.io import CHANNELS, ImageError, coloured_layer, load_bitmap
 from nma.params import Param
 
-# What a grey pixel's channels may differ by, for pixels up to 1: rounding.
+# The channels of a grey pixel may differ by this much, through rounding; for pixels above 1, relative to the pixel.
 _GREY = 1e-6
 
 
@@ -22,9 +22,9 @@ _GREY = 1e-6
 class Texture:
     """An image that drives `parameter`: its value is offset + scale * pixel.
 
-    Pixels of a `raw` image are the numbers in the file, bytes as 0..1; otherwise 8-bit images are sRGB and
-    made linear. A parameter of one number wants a grey image, or one of the `CHANNELS` of any. The image lies
-    `uv_scale` times along a unit of uv.
+    Pixels of a `raw` image are the numbers in the file, with bytes scaled to 0..1. Otherwise 8-bit images are sRGB and
+    are made linear. A parameter of one number needs a grey image, or a `channel` out of `CHANNELS`. The image repeats
+    `uv_scale` times per unit of uv.
     """
 
     parameter: Param
@@ -36,12 +36,12 @@ class Texture:
     uv_scale: float = 1.0
 
     def read(self) -> NDArray[np.float32]:
-        """The parameter's values (height, width, size), row 0 at the top of the image.
+        """The parameter's values (height, width, size); row 0 is the top of the image.
 
-        Raises `TextureError` if the file cannot be read, is coloured where a channel must be chosen, or holds values
-        that are not finite or physically invalid.
+        Raises `TextureError` if the file cannot be read, if it is coloured but the parameter is one number and no
+        channel is chosen, or if values are not finite or not valid.
         """
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused below
             values = self._pixels() * np.float32(self.scale) + np.float32(self.offset)
         allowed = self.parameter.bounds("valid")
         bad = allowed.bad(values)
@@ -51,7 +51,7 @@ class Texture:
         return allowed.moved(values)
 
     def _pixels(self) -> NDArray[np.float32]:
-        """The image (height, width, size), linear unless `raw`, grey where `size` is 1."""
+        """The image (height, width, size): linear unless `raw`, and one channel if `size` is 1."""
 
         bitmap = _bitmap(self.path)
         if self.channel == "a" and "A" not in [field.name for field in bitmap.struct_()]:
@@ -72,7 +72,7 @@ class Texture:
         return pixels[..., first : first + 1]
 
     def _format(self, own: Any) -> Any:
-        """What to convert pixels to: no more channels than are looked at, as images may be large."""
+        """The pixel format to convert to. It has only the channels that are needed, because images may be large."""
         import mitsuba as mi
 
         formats: Any = mi.Bitmap.PixelFormat
@@ -82,7 +82,7 @@ class Texture:
 
 
 def first_pixel(pixels: NDArray, bad: NDArray[np.bool_]) -> tuple[NDArray, str]:
-    """The first pixel (channels,) of an image (height, width, channels) with bad values, and in words where it is."""
+    """The first bad pixel (channels,) of an image (height, width, channels), and text that says where it is."""
     row, column, _ = np.argwhere(bad)[0]
     if bad.shape[:2] == (1, 1):
         return pixels[0, 0], ""
@@ -92,7 +92,7 @@ def first_pixel(pixels: NDArray, bad: NDArray[np.bool_]) -> tuple[NDArray, str]:
 
 
 def _converted(bitmap: Any, pixel_format: Any) -> NDArray[np.float32]:
-    """The pixels (height, width, channels), made linear where they are sRGB."""
+    """The pixels (height, width, channels), converted to linear values if they are sRGB."""
     import mitsuba as mi
 
     array = np.array(bitmap.convert(pixel_format, mi.Struct.Type.Float32, srgb_gamma=False))
@@ -100,7 +100,7 @@ def _converted(bitmap: Any, pixel_format: Any) -> NDArray[np.float32]:
 
 
 def _bitmap(path: Path) -> Any:
-    """The image, or its layer in colour where it has several."""
+    """The image; if it has several layers, the first layer in colour."""
     import mitsuba as mi
 
     if not os.path.isfile(path):
@@ -115,12 +115,12 @@ def _bitmap(path: Path) -> Any:
         raise TextureError(str(error)) from error
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         names = ", ".join(field.name for field in bitmap.struct_())
-        raise TextureError(f"texture {path} has the channels {names}; wanted are R, G, B (and A), or Y")
+        raise TextureError(f"texture {path} has the channels {names}; it needs R, G, B (and A), or Y")
     return bitmap
 
 
 def _is_coloured(rgb: NDArray[np.float32]) -> bool:
-    """Whether the channels differ anywhere by more than rounding."""
+    """Whether the channels of any pixel differ by more than rounding."""
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)
     return bool((spread > _GREY * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())

@@ -1,4 +1,4 @@
-"""Whether numbers and pixels are allowed for a parameter, and what to say where they are not."""
+"""Checks whether numbers and pixels are allowed for a parameter, and makes the error messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nma.params import Param, Range
 
 
 class Allowed(NamedTuple):
-    """What a parameter may be: within a range of its own, or with `clamp` anything finite."""
+    """The allowed values of a parameter: its range, or with `clamp` all finite numbers."""
 
     param: Param
     range: Range
@@ -28,7 +28,7 @@ class Allowed(NamedTuple):
 
 
 def check_numbers(allowed: Allowed, value: Any) -> None:
-    """Refuses numbers that are not allowed. Raises `ParamError`."""
+    """Raises `ParamError` for numbers that are not allowed."""
     numbers = _plain(value).ravel()
     name, size = allowed.param.name, allowed.param.size
     if numbers.size not in (1, size):
@@ -38,11 +38,11 @@ def check_numbers(allowed: Allowed, value: Any) -> None:
 
 
 def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: int | None) -> None:
-    """Refuses textures that hold what is not allowed, or colours where one number is wanted. Raises `TextureError`.
+    """Raises `TextureError` for values that are not allowed, or for colours in a texture of a parameter of one number.
 
     Args:
-        leaves: the arrays of pixels and numbers that it is made of, as far as they are known before rendering.
-        channel: the one of its three that counts, if one was chosen.
+        leaves: the texture's arrays of pixels and numbers, as far as they are known before rendering.
+        channel: index of the channel that is used, if one was chosen.
     """
     name = f" ({texture.id()})" if texture.id() else ""
     where = f"the texture of {allowed.param.name}{name}"
@@ -58,15 +58,18 @@ def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: in
 
 
 def _plain(value: Any) -> NDArray:
-    """The numbers of a Dr.Jit array. Colours go channel by channel: in one piece they would be scattered into an array,
-    which cannot be read while Dr.Jit records."""
+    """The values of a Dr.Jit array as a NumPy array.
+
+    Colours are converted channel by channel. Converting a whole colour scatters it into one array, which cannot be read
+    while Dr.Jit records.
+    """
     import mitsuba as mi
 
     return np.concatenate([np.array(c) for c in value]) if isinstance(value, mi.Color3f) else np.array(value)
 
 
 def _decoded(pixels: NDArray, texture: Any) -> NDArray:
-    """The numbers that the texture evaluates to: Mitsuba keeps pixels of 8-bit files as bytes, sRGB unless `raw`."""
+    """The values to which the texture evaluates. Mitsuba keeps 8-bit files as bytes, which are sRGB unless `raw`."""
     if pixels.dtype != np.uint8:
         return pixels
     unit = pixels / 255.0
@@ -74,7 +77,7 @@ def _decoded(pixels: NDArray, texture: Any) -> NDArray:
 
 
 def _check_pixels(allowed: Allowed, pixels: NDArray, where: str, channel: int | None) -> None:
-    """Pixels are (height, width, channels); a single number or colour is an image of one pixel."""
+    """Checks pixels (height, width, channels). A single number or colour counts as an image of one pixel."""
     name, size = allowed.param.name, allowed.param.size
     coloured = pixels.shape[-1] >= 3
     if coloured and channel is not None:

@@ -1,4 +1,4 @@
-"""Source parameters as the inputs of a Mitsuba BSDF: numbers, colours or textures, checked when they are loaded."""
+"""The parameters of a material as inputs of a Mitsuba BSDF: numbers, colours or textures, checked when loaded."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from nma.render.textures import bitmap_texture
 class Inputs:
     """The parameters of a class, read from a BSDF's properties.
 
-    A property has a parameter's name. A number or a colour is taken as it is, unbounded and linear, since refractive
-    indices are no reflectances; textures that hold such numbers want `raw`. The property `NAME_channel` ("r", "g" or
-    "b") chooses a channel of a coloured texture for a parameter of one number. The property `material` names a material
-    (shipped, or a `.toml` file) whose values fill in for the parameters that are not given.
+    A property has the name of a parameter. Numbers and colours are linear and are not limited to 0 .. 1, because
+    refractive indices are not reflectances; textures of such numbers need `raw`. The property `NAME_channel` ("r", "g"
+    or "b") chooses the channel of a coloured texture for a parameter of one number. The property `material` names a
+    material (a shipped one, or a `.toml` file), whose values are used for the parameters that are not given.
 
     `values` maps each name to a `mi.Float` (size 1), a `mi.Color3f` (size 3) or a `mi.Texture`. Numbers and pixels must
-    be finite and within `bounds`; with `clamp` they are moved there instead. What cannot be known before rendering
-    (mesh attributes, edits inside of frozen functions) is moved there always.
+    be finite and within `bounds`; with `clamp` they are moved to the bounds instead. Values that are not known before
+    rendering (mesh attributes, edits inside frozen functions) are always moved.
 
-    Kernels take the numbers from memory: an edit compiles nothing, and materials of one structure share a kernel.
+    Kernels read the numbers from memory, so that an edit compiles nothing and materials with the same textured
+        parameters share a kernel.
     """
 
     # Frozen functions of Dr.Jit look for variables here.
@@ -65,7 +66,7 @@ class Inputs:
         return [channel for param in self.space.params for channel in self.channels(param.name, si, active)]
 
     def channels(self, name: str, si: Any = None, active: Any = True) -> list[Any]:
-        """The one or three numbers of a parameter, within its bounds."""
+        """The one or three channels of a parameter, moved within its bounds."""
         import mitsuba as mi
 
         param, value = self.space[name], self.values[name]
@@ -89,12 +90,13 @@ class Inputs:
         return ",\n".join(f"  {name} = {value}".replace("\n", "\n  ") for name, value in self.values.items())
 
     def check(self, numbers: bool = False) -> None:
-        """Checks the textures, and with `numbers` all inputs, that were changed since they were checked last. Raises
-        `ParamError`, `TextureError`, and puts back what was there: Dr.Jit records all BSDFs that there are, so one in
-        error would stop other scenes, too.
+        """Checks the textures, and with `numbers` all inputs, that have changed since the last check.
 
-        Called wherever inputs are used as well: Mitsuba does not tell of edits of a texture that several BSDFs share. A
-        frozen function knows no values; what it sets is moved within bounds.
+        Raises `ParamError` or `TextureError` for a bad value, and restores the last good value first. Dr.Jit records
+        all existing BSDFs, so a BSDF with a bad value would also stop other scenes.
+
+        It is called wherever inputs are used, because Mitsuba does not report edits of a texture that several BSDFs
+        share. While Dr.Jit freezes a function there are no values to check; edits are then moved within the bounds.
         """
         import drjit as dr
 
@@ -106,7 +108,7 @@ class Inputs:
             raise fault
 
     def _fault(self, param: Param) -> ParamError | TextureError | None:
-        """What is wrong with an input that was changed; it is undone then, else remembered."""
+        """The error of a changed input, or None. A bad change is undone; a good one is remembered."""
         import mitsuba as mi
 
         seen, value = self._seen[param.name], self.values[param.name]
@@ -125,20 +127,20 @@ class Inputs:
         return None
 
     def changed(self) -> None:
-        """Takes note of edits in place, and checks them. Raises what `check` does."""
+        """Checks all inputs after edits. Raises the errors of `check`."""
         import drjit as dr
         import mitsuba as mi
 
         for value in self.values.values():
             if not isinstance(value, mi.Texture):
-                dr.make_opaque(value)  # Mitsuba sets literals, which would be compiled into the kernel
+                dr.make_opaque(value)  # literals, which Mitsuba sets, would be compiled into the kernel
         self.check(numbers=True)
 
 
 def of_adapter(adapter: Adapter, props: Any) -> Inputs:
-    """The inputs that an adapter has: the parameters of its class, or none where it knows a single material.
+    """The inputs of an adapter: the parameters of its class, or none for an adapter of a single material.
 
-    Parameters that are given all the same must be that material's. Raises `ParamError`.
+    Parameters given to an adapter of a single material must be those of this material. Raises `ParamError`.
     """
     import mitsuba as mi
 
@@ -159,9 +161,10 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
 
 
 class _Seen:
-    """The numbers behind an input: as they are, and as they were when they were checked.
+    """The arrays of an input: the current arrays, and the arrays that were checked last.
 
-    Keeps the arrays that were checked, as the numbers of Dr.Jit's variables are given out anew when one is gone.
+    Changes are detected by the indices of Dr.Jit's variables. The checked arrays are kept alive, because Dr.Jit reuses
+    the index of a variable that is freed.
     """
 
     def __init__(self, value: Any):
@@ -173,7 +176,7 @@ class _Seen:
         self._checked: list[Any] | None = None
 
     def leaves(self) -> list[Any]:
-        """The arrays of pixels and numbers, as they are."""
+        """The current arrays of pixels and numbers."""
         if self._number is not None:
             return [self._number]
         return [self._params[name] for name in self._names]
@@ -190,7 +193,7 @@ class _Seen:
         self._checked = [type(leaf)(dr.detach(leaf)) for leaf in leaves]
 
     def put_back(self) -> None:
-        """What was checked last, if anything was."""
+        """Restores the arrays that were checked last, if there are any."""
         import mitsuba
 
         mi: Any = mitsuba  # its types do not know this function
@@ -205,19 +208,19 @@ class _Seen:
 
 
 def _known(key: str) -> bool:
-    """Whether a texture shows the numbers that it is made of under this key."""
+    """Whether a texture's entry `key` of `mi.traverse` holds its pixels or its value."""
     return key.rpartition(".")[2] in ("data", "value")
 
 
 def _indices(values: list[Any]) -> list[int]:
-    """The numbers of Dr.Jit's variables, without those of their derivatives."""
+    """The indices of the arrays' Dr.Jit variables, without the indices of their derivatives."""
     import drjit as dr
 
     return [index & 0xFFFFFFFF for index in dr.detail.collect_indices(values)]
 
 
 def _value(param: Param, given: Any) -> Any:
-    """An input in the form of `values`."""
+    """An input as an entry of `Inputs.values`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -253,7 +256,7 @@ def _read(param: Param, props: Any) -> Any:
 
 
 def _numbers(param: Param, channels: Any) -> Any:
-    """The numbers of a colour for the parameter; a grey one will do where one number is wanted."""
+    """The channels of a colour as a parameter's value. A parameter of one number accepts only grey colours."""
     if not isinstance(channels, list) or param.size == 3:
         return channels
     if len(set(channels)) > 1:
@@ -263,7 +266,7 @@ def _numbers(param: Param, channels: Any) -> Any:
 
 
 def _constant(texture: Any) -> Any:
-    """The numbers of a texture that is the same everywhere, or the texture itself."""
+    """The channels of a constant texture as a list; any other texture unchanged."""
     import mitsuba as mi
 
     params = mi.traverse(texture)
@@ -273,7 +276,7 @@ def _constant(texture: Any) -> Any:
 
 
 def _channel(param: Param, props: Any, value: Any) -> int | None:
-    """Which channel of a texture a parameter of one number takes, if that is said."""
+    """The index of the texture channel chosen for a parameter of one number; None if none is chosen."""
     import mitsuba as mi
 
     name = f"{param.name}_channel"
@@ -288,7 +291,7 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
 
 
 def _setting(props: Any, name: str, default: Any) -> Any:
-    """A property that is no parameter, of the type of its default: the text "false" would be taken for true."""
+    """A property that is no parameter. It must have the type of `default`: the text "false" would count as true."""
     value = props.get(name, default)
     if not isinstance(value, type(default)):
         wanted = "true or false (boolean)" if isinstance(default, bool) else "a name (string)"
@@ -297,16 +300,18 @@ def _setting(props: Any, name: str, default: Any) -> Any:
 
 
 def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
-    """A named material's values; its textures as Mitsuba's."""
+    """The values of a named material, with its textures as Mitsuba textures."""
     import mitsuba
 
     mi: Any = mitsuba  # its types change with the variant
 
-    # Files lie beside the scene, as those of Mitsuba's own plugins do.
+    # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
     found = mi.file_resolver().resolve(name) if name.endswith(".toml") else name
     material = materials.load(str(found))
     if material.class_name != space.name:
-        raise ParamError(f"material '{name}' is of class {material.class_name}, wanted is {space.name}")
+        raise ParamError(
+            f"material '{name}' is of class {material.class_name}, but this BSDF needs class {space.name}"
+        )
     return {
         key: mi.load_dict(bitmap_texture(value.read(), scale=value.uv_scale))
         if isinstance(value, materials.Texture)

@@ -1,4 +1,4 @@
-"""Batches of bins, drawn with NumPy from tables in memory, each step's draw determined by (seed, step) alone."""
+"""Draws batches of bins from tables in memory, with NumPy. The batch of a step depends only on (seed, step)."""
 
 from __future__ import annotations
 
@@ -16,31 +16,33 @@ from nma.table import ISOTROPIC, Grid, Tables
 from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import Recipe
 
-# Materials that a stream exchanges at a time: enough to keep the simulation's lanes busy.
+# A stream replaces this many materials at once, enough to keep the lanes of the simulation busy.
 STREAM_BLOCK = 16
 
 
 class Batch(NamedTuple):
-    """Bins of one step; rows come last so that everything per row broadcasts along contiguous memory."""
+    """The bins of one step. Rows are the last axis, so that values per row broadcast along contiguous memory."""
 
     columns: NDArray[np.float32]  # (parameters, rows)
-    mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs, anywhere in the row
-    phi: NDArray[np.float32]  # (rows,) azimuth of wi there, 0 for isotropic tables
+    mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs, at a random place in the row
+    phi: NDArray[np.float32]  # (rows,) azimuth of wi, 0 for isotropic tables
     i: NDArray[np.float32]  # (rows,) bin of cos(theta_i)
     a: NDArray[np.float32]  # (rows,) bin of phi, 0 for isotropic tables
     o: NDArray[np.float32]  # (bins_per_row, rows)
     p: NDArray[np.float32]  # (bins_per_row, rows)
     shift: NDArray[np.float32]  # (3 or 4, bins_per_row, rows) random shift of the points' lattice
-    weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, undoes the choice of bins
-    value: NDArray[np.float32]  # (3, bins_per_row, rows) the table
+    weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, corrects for the choice of bins
+    value: NDArray[np.float32]  # (3, bins_per_row, rows) values of the table
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at `mu`
-    albedo_shift: NDArray[np.float32]  # (3, 2, rows) random shifts of the samples that estimate the target's
+    albedo_shift: NDArray[
+        np.float32
+    ]  # (3, 2, rows) random shifts of the samples that estimate the target's albedo
     quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to a bin
 
 
 @dataclass
 class Pool:
-    """Tables that batches are drawn from."""
+    """Tables from which batches are drawn."""
 
     params: NDArray[np.float32]
     values: NDArray[np.floating]
@@ -54,13 +56,15 @@ class Pool:
         return Pool(tables.params.astype(np.float32), tables.values, tables.walks, albedo, tables.grid)
 
     def bins(self, m: NDArray, i: NDArray, a: NDArray, o: NDArray, p: NDArray) -> NDArray:
-        """Values (..., 3) of some bins; colours out of the gamut are moved there, as no BRDF is negative."""
+        """The values (..., 3) of some bins. Negative channels become 0: no BRDF is negative."""
         rows = (m, i, a) if self.grid.phi_i else (m, i)
         return np.maximum(self.values[(*rows, o, p)], 0.0)
 
     def albedo_at(self, m: NDArray, i: NDArray, a: NDArray, mu: NDArray) -> NDArray:
-        """Directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i` (and `a`): linear within a row,
-        with the slope between its neighbours and the row's own mean."""
+        """The directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i` (and `a`).
+
+        It is linear within a row: it has the mean of the row, and the slope between the neighbouring rows.
+        """
         last = self.grid.theta_i - 1
         above, below = np.minimum(i + 1, last), np.maximum(i - 1, 0)
         around = (a,) if self.grid.phi_i else ()
@@ -71,10 +75,10 @@ class Pool:
 
 
 class Stream:
-    """A pool of fresh materials: every `refresh` steps a block of new ones replaces the oldest.
+    """A pool of simulated materials. Every `refresh` steps, a block of new materials replaces the oldest block.
 
-    The pool of a step depends on the settings and the step alone, so that a resumed run sees what it would have seen.
-    `settings.materials` is the size of the pool. Steps must be asked for in ascending order.
+    The pool of a step depends only on the settings and the step, so that a resumed run sees the same materials.
+    `settings.materials` is the size of the pool. Call it with steps in ascending order.
     """
 
     def __init__(self, settings: Settings, refresh: int, first_step: int = 0):
@@ -83,7 +87,7 @@ class Stream:
         self._replaced = first_step // refresh
         oldest = self._replaced * self._block
         indices = np.arange(oldest, oldest + settings.materials)
-        # Material k lives in slot k modulo the size.
+        # Material k is stored in slot k modulo the size.
         tables = simulate_block(settings, indices[np.argsort(indices % settings.materials)])
         self._pool = Pool.of(tables)
         self._pool.values = self._pool.values.astype(np.float16)
@@ -102,16 +106,18 @@ class Stream:
 
 
 class BinSampler:
-    """Chooses bins of wo for rows of wi, and says by how much each choice must count."""
+    """Chooses bins of wo for rows of wi, and returns the weight of each choice."""
 
     def __init__(self, law: str, grid: Grid = ISOTROPIC):
         self.grid = grid
         self.uniform_share = 1.0 if law == "uniform" else 0.5
-        # Cauchy-like falloff over a few bins from the mirror direction, in each coordinate.
+        # Probabilities fall off like a Cauchy distribution over a few bins from the mirror direction, in each
+        # coordinate.
         steps = np.arange(grid.theta_o)
         near_o = 1.0 / (1.0 + ((steps[None, :] - steps[:, None]) / 1.5) ** 2)
         self._o = near_o / near_o.sum(axis=1, keepdims=True)
-        # Bins from the mirror direction's: folded tables have that last, others on both sides of it.
+        # Distance in bins from the mirror direction. It is the last bin of isotropic tables, whose azimuths are folded;
+        # anisotropic tables have bins on both sides of it.
         steps = np.arange(grid.phi_o)
         steps = np.minimum(steps, grid.phi_o - steps) if grid.phi_i else grid.phi_o - 1 - steps
         near_p = 1.0 / (1.0 + (steps / 1.5) ** 2)
@@ -122,7 +128,7 @@ class BinSampler:
     def draw(
         self, rng: np.random.Generator, i: NDArray, a: NDArray, count: int
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """(o, p, weight), each (count, rows), for the rows' bins `i` and `a` (rows,)."""
+        """Chooses bins for the rows with bins `i` and `a` (rows,): (o, p, weight), each (count, rows)."""
         u = rng.random((2, count, len(i)))
         o = (u[0] * self.grid.theta_o).astype(np.int64)
         p = (u[1] * self.grid.phi_o).astype(np.int64)
@@ -148,7 +154,7 @@ class BinSampler:
 
 
 def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
-    """The bins of one step."""
+    """The batch of one step."""
     rng = np.random.default_rng((recipe.seed, step, 0xB17))
     m = rng.integers(len(pool.params), size=recipe.rows)
     i = rng.integers(pool.grid.theta_i, size=recipe.rows)
@@ -177,7 +183,7 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
 
 
 def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> Iterator[tuple[int, Any]]:
-    """(first step, `group` steps stacked) from `start` to `stop`, prepared by a thread ahead of their use."""
+    """Yields (first step, stacked batches of `group` steps) from `start` to `stop`. A thread prepares them ahead."""
     queue: Queue = Queue(maxsize=2)
     stopped = threading.Event()
 
@@ -190,7 +196,7 @@ def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> 
                 if stopped.is_set():
                     return
             queue.put(None)
-        except BaseException as e:  # handed to the consumer, which raises it
+        except BaseException as e:  # passed to the consumer, which raises it
             queue.put(e)
 
     thread = threading.Thread(target=produce, daemon=True)
@@ -201,7 +207,7 @@ def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> 
                 raise item
             yield item
     finally:
-        # A consumer that leaves early must not leave the thread waiting for room in the queue.
+        # If the consumer stops early, the thread must not wait for room in the queue forever.
         stopped.set()
         while thread.is_alive():
             with suppress(Empty):

@@ -1,4 +1,4 @@
-"""An adapter for a single material of which nothing is known but its values, or a table of them (paper Fig. 4, 13)."""
+"""Fits an adapter to a single material, given by its values or by a table of them (paper Fig. 4, 13)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Progress = Callable[[loop.Run], None]
 
 
 def recipe_for(source: Values | Tables, **changes: Any) -> Recipe:
-    """The settings that suit a source, isotropic or not, with or without noise.
+    """The recipe for a source: isotropic or anisotropic, with noise (tables) or without (values).
 
-    `changes` are fields of `Recipe`; None leaves one as it is.
+    `changes` are fields of `Recipe`; the value None leaves a field unchanged.
     """
     changes = {name: value for name, value in changes.items() if value is not None}
     if isinstance(source, Tables):
@@ -41,13 +41,13 @@ def fit(
     progress: Progress | None = None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Adapter, loop.Run]:
-    """An adapter of class "measured", which has no parameters, for one material.
+    """Fits an adapter of class "measured", which has no parameters, to one material. Returns the adapter and the run.
 
-    Sources that know their values are compared with the target point by point, tables bin by bin, isotropic or not.
-    `recipe_for(source)` is the recipe unless another is given; `record` says where the source comes from and is stored
-    with the weights. `progress` is called as training goes on; without one, a bar goes along on stderr if that is a
-    terminal, and `lambda run: None` keeps it quiet. Raises `NmaError` where the recipe is for isotropic materials and
-    the source is not, or the other way round, and `TableError` for tables of several materials.
+    Sources of values are compared with the target point by point, and tables bin by bin. The default recipe is
+    `recipe_for(source)`. `record` says where the source comes from and is stored with the weights. `progress` is called
+    during training; without it, a progress bar is shown on stderr if that is a terminal (`lambda run: None` shows
+    nothing). Raises `NmaError` if only one of recipe and source is isotropic, and `TableError` for tables of several
+    materials.
     """
     recipe = recipe or recipe_for(source)
     with of_training(progress, recipe, "fitting") as show:
@@ -62,7 +62,7 @@ def _fit_values(
     _check_isotropy(source.name, source.isotropic, recipe)
     if recipe.loss != "log":
         raise NmaError(
-            f"{source.name} has values without noise, which the loss 'log' is for, not '{recipe.loss}'"
+            f"{source.name} has values without noise; they need the loss 'log', not '{recipe.loss}'"
         )
     pool = PointPool.of(source, seed=recipe.seed)
     run = loop.start(recipe, initial_layers(recipe, MEASURED), record)
@@ -90,4 +90,4 @@ def _fit_table(
 def _check_isotropy(name: str, isotropic: bool, recipe: Recipe) -> None:
     if isotropic == (recipe.target == "anisotropic"):
         kind = "isotropic" if isotropic else "anisotropic"
-        raise NmaError(f"{name} is {kind}; take a recipe for such: its target, encoding and grid")
+        raise NmaError(f"{name} is {kind}; take a recipe whose target, encoding and grid are {kind}")

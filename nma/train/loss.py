@@ -1,6 +1,6 @@
 """The loss of a batch: Average-vs-Average (paper eq. 6) in the log domain (eq. 7).
 
-What concerns rows alone takes batches of points (`nma.train.points`), too.
+Functions that use only the rows of a batch also accept batches of points (`nma.train.points`).
 """
 
 from __future__ import annotations
@@ -19,20 +19,22 @@ from nma.target import Brdf
 from nma.train.batches import Batch
 from nma.train.recipe import Recipe
 
-# Residuals of the log domain that the Huber loss treats as noise even where a bin has hardly any.
+# The Huber loss treats residuals of the logarithm up to this size as noise, even in bins with hardly any noise.
 _TOLERANCE = 0.003
 
 
 def network_outputs(layers: Layers, batch: Any, recipe: Recipe) -> jax.Array:
-    """(rows, numbers of the target), one pass of the network per row, at its cosine `mu`."""
+    """The raw outputs (rows, outputs) of the network, which runs once per row, at the cosine `mu` of the row."""
     wi = view(batch)
     inputs = encoding.get(recipe.encoding)(list(batch.columns), wi if recipe.directional else None)
     return network.forward(layers, jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1))
 
 
 def brdf_of(layers: Layers, batch: Any, recipe: Recipe) -> Brdf:
-    """The target of each row, (rows,). Isotropic batches look from the azimuth 0, where the local frame is that of the
-    plane of incidence."""
+    """The target of each row, with parameters (rows,).
+
+    Isotropic batches have wi at the azimuth 0, where the frame of the plane of incidence is the local frame.
+    """
     raw = network_outputs(layers, batch, recipe)
     blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
     return Brdf(target.bounded(blend, batch.mu) if recipe.bounds_energy else blend)
@@ -52,7 +54,7 @@ def view(batch: Any) -> Vec3:
 
 
 def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
-    """Points (points, bins_per_row, rows) of every bin."""
+    """The points (points, bins_per_row, rows) of every bin."""
     if recipe.points_law == "centre":
         u: Any = (0.5 + 0.0 * batch.shift)[:, None]
     else:
@@ -65,7 +67,7 @@ def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
 def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
     """Two independent unbiased estimates of the target's directional albedo, (2, 3, rows), from its own samples.
 
-    The samples are held fixed while the target changes, so that derivatives are unbiased too, and none is clipped.
+    Derivatives treat the samples as constants. This makes the derivatives unbiased, too, and no estimate is clipped.
     """
     lattice = jnp.asarray(quadrature.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
@@ -77,32 +79,33 @@ def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
 
 
 def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """(what is minimised, the log loss of eq. 7 against the noisy tables)."""
+    """The loss to minimise, and the log loss of eq. 7 against the noisy tables."""
     return brdf_loss(brdf_of(layers, batch, recipe), batch, recipe)
 
 
 def brdf_loss(brdf: Brdf, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The same for a target of numbers that are constant or (rows,)."""
+    """The same as `loss`, for a target whose parameters are constant or (rows,)."""
     total, log_loss = distance(bin_means(brdf, batch, recipe), batch, recipe)
     return total + albedo_loss(brdf, batch, recipe), log_loss
 
 
 def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
-    """The recipe's weight of the squared error of the directional albedo, times that."""
+    """The squared error of the directional albedo, times its weight in the recipe."""
     if not recipe.albedo > 0:
         return 0.0
-    # The product of two independent errors has the squared error as its mean, without the estimate's variance.
+    # The mean of the product of two independent errors is the squared error, without the variance of the estimates.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 
 
 def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """(recipe's distance, log loss) of a model's bin means (3, bins_per_row, rows) from the tables."""
+    """The recipe's distance, and the log loss, between bin means (3, bins_per_row, rows) and the tables."""
     residual = jnp.log1p(mean) - jnp.log1p(batch.value)
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":
         return log_loss, log_loss
-    # Counting noise of the bin under the model: about mean / quantum walks, at least the noise of a single one.
+    # Counting noise of the bin under the model: about mean / quantum walks hit the bin. It is at least that of one
+    # walk.
     expected = jax.lax.stop_gradient(mean)
     sigma = jnp.sqrt(batch.quantum * (expected + batch.quantum)) / (1.0 + expected)
     width = 3.0 * sigma + _TOLERANCE

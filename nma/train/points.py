@@ -1,7 +1,7 @@
-"""Supervision by a source's own values at points: what sources that know them (`Values`) are fitted to.
+"""Training data for sources whose values are known (`Values`): their values at pairs of directions.
 
-A table's bins have to be averaged over, as nothing else is known of them. Where values are known, every point of the
-target is compared with the source's at the same pair of directions, which needs an eighth of the evaluations.
+For a table only the averages of bins are known, so the target must be averaged over bins. Where values are known, the
+target is compared with the source at each pair of directions, which needs an eighth of the evaluations.
 """
 
 from __future__ import annotations
@@ -26,33 +26,35 @@ from nma.target.sampling import sample_spec
 from nma.train.loss import albedo_loss, brdf_of, view
 from nma.train.recipe import Recipe
 
-# View directions of the pool, and points wo of each.
+# Number of view directions of the pool, and of directions wo for each view direction.
 ROWS, POINTS = 8192, 512
-# One point of so many crowds around the mirror direction, the others are uniform: enough to find narrow lobes, and few,
-# as what is smooth learns less from them.
+# One direction wo in this many is drawn near the mirror direction; the others are uniform. This is enough to find
+# narrow lobes. It is not more because smooth parts of the material are learned less well from these directions.
 _CROWDED = 4
-# Widths of the microfacet lobes that crowded points are drawn from.
+# Widths (alpha) of the microfacet lobes from which the directions near the mirror direction are drawn.
 _WIDTHS = tuple(0.0005 * 2.0**k for k in range(11))
-# Rows that are evaluated at once: bounds the memory.
+# Number of rows that are evaluated at once, which bounds the memory.
 _ROWS_PER_LAUNCH = 2048
 
 
 class PointBatch(NamedTuple):
-    """Points of one step; rows come last, as in `nma.train.batches.Batch`."""
+    """The points of one step. Rows are the last axis, as in `nma.train.batches.Batch`."""
 
     columns: NDArray[np.float32]  # (0, rows): a single material has no parameters
     mu: NDArray[np.float32]  # (rows,) cos(theta_i)
     phi: NDArray[np.float32]  # (rows,) azimuth of wi
     wo: NDArray[np.float32]  # (3, points, rows)
-    weight: NDArray[np.float32]  # (points, rows) mean 1, undoes the crowding
+    weight: NDArray[np.float32]  # (points, rows) mean 1, corrects for the uneven density of wo
     value: NDArray[np.float32]  # (3, points, rows)
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at wi
-    albedo_shift: NDArray[np.float32]  # (3, 2, rows) random shifts of the samples that estimate the target's
+    albedo_shift: NDArray[
+        np.float32
+    ]  # (3, 2, rows) random shifts of the samples that estimate the target's albedo
 
 
 @dataclass
 class PointPool:
-    """Values of one source at many pairs of directions, (ROWS, POINTS)."""
+    """The values of one source at ROWS x POINTS pairs of directions."""
 
     mu: NDArray[np.float32]  # (ROWS,)
     phi: NDArray[np.float32]  # (ROWS,)
@@ -63,12 +65,12 @@ class PointPool:
 
     @staticmethod
     def of(source: Values, *, seed: int = 0, rows: int = ROWS, points: int = POINTS) -> PointPool:
-        """Determined by the seed. Colours out of the gamut are moved there, as no BRDF is negative.
+        """The pool of a source, determined by the seed. Negative values (colours out of gamut) become 0.
 
         Raises `SourceError` for values that are not finite.
         """
         rng = np.random.default_rng((seed, 0x9017))
-        # Every row has a stratum of cos(theta_i) to itself.
+        # Every row has its own stratum of cos(theta_i).
         mu = (rng.permutation(rows) + rng.random(rows)) / rows
         phi = np.zeros(rows) if source.isotropic else rng.uniform(0.0, 2.0 * math.pi, rows)
         shift = rng.random((3, rows))
@@ -85,10 +87,10 @@ class PointPool:
         return PointPool(*(x.astype(np.float32) for x in (mu, phi, wo, weight, value, albedo)))
 
     def draw(self, recipe: Recipe, step: int) -> PointBatch:
-        """The points of one step: random rows, and in each a random share of its points."""
+        """The points of one step: random rows, and random points of each row."""
         rng = np.random.default_rng((recipe.seed, step, 0x90))
         m = rng.integers(len(self.mu), size=recipe.rows)
-        # Neighbours, as uniform and crowded points take turns.
+        # The points are consecutive, because every _CROWDED-th point is one near the mirror direction.
         count = recipe.bins_per_row * recipe.points
         k = (
             rng.integers(self.weight.shape[1], size=recipe.rows) + np.arange(count)[:, None]
@@ -108,7 +110,7 @@ class PointPool:
 def _evaluated(
     source: Values, mu: NDArray, phi: NDArray, shift: NDArray, points: int
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """(wo (3, rows, points), weight (rows, points), value (3, rows, points)) for some rows."""
+    """Evaluates some rows: wo (3, rows, points), weight (rows, points), value (3, rows, points)."""
     Float = dr.auto.Float
 
     def lanes(x: NDArray) -> Any:
@@ -125,8 +127,11 @@ def _evaluated(
 
 
 def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
-    """wo from uniform numbers, uniform over the hemisphere or, where `crowded` is 1, around the mirror direction; and
-    the density of uniform directions over that of the mixture of both, 0 below the horizon."""
+    """Directions wo from uniform numbers, and their weights.
+
+    wo is uniform over the hemisphere or, where `crowded` is 1, drawn near the mirror direction. The weight is the
+    density of uniform directions divided by the density of the mixture, and 0 below the horizon.
+    """
     turn = (2.0 * math.pi) * u[0]
     across = ops.safe_sqrt(1.0 - u[1] * u[1])
     uniform = Vec3(across * dr.cos(turn), across * dr.sin(turn), u[1])
@@ -142,7 +147,7 @@ def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
 
 
 def points_loss(layers: Any, batch: PointBatch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """(what is minimised, the log loss of eq. 7 at the points). For `nma.train.loop`, in place of the loss of bins."""
+    """The loss to minimise, and the log loss of eq. 7 at the points. `nma.train.loop` takes it as `objective`."""
     brdf = brdf_of(layers, batch, recipe)
     value = jnp.stack(list(brdf.eval(view(batch), Vec3(*batch.wo))))
     log_loss = (jnp.abs(jnp.log1p(value) - jnp.log1p(batch.value)) * batch.weight).mean()

@@ -1,4 +1,4 @@
-"""Training runs from data to a weights file: a whole class, or one material."""
+"""Runs a training from data to an adapter, for a whole class or for one material."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from nma.train import loop
 from nma.train.batches import BinSampler, Pool, Stream, draw
 from nma.train.recipe import Recipe
 
-# Where training starts: a coloured rough metal under a sharp, colourless reflection.
+# The blend at which training starts: a coloured rough metal, and a sharp, colourless reflection.
 _INITIAL = Blend(
     (
         Principled(Color(0.5, 0.5, 0.5), 0.5, 0.5, 0.5, 0.1, 0.1, 0.1, 0.1, 0.5, 0.0, 0.1, 0.0, 0.12),
@@ -37,7 +37,7 @@ _INITIAL = Blend(
 
 
 def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
-    """Random layers whose output starts at a plausible blend; determined by the recipe's seed."""
+    """Random layers, determined by the recipe's seed, whose outputs are close to a plausible blend."""
     instances = tuple(_INITIAL.instances[k % 2] for k in range(recipe.instances))
     blend = Blend(instances, (1.0 / recipe.instances,) * recipe.instances)
     params = target.TARGETS[recipe.target]
@@ -58,10 +58,11 @@ def train_class(
     progress: Callable[[loop.Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Adapter, loop.Run]:
-    """Trains on tables of many materials; `record` says where they come from and is stored with the weights.
+    """Trains an adapter on tables of many materials. Returns the adapter and the run.
 
-    Given settings instead of tables, training streams: it keeps `data.materials` in memory and exchanges a block of
-    them for fresh ones every `refresh` steps.
+    `record` says where the tables come from and is stored with the weights. If `data` is settings instead of tables,
+    materials are simulated during training: `data.materials` of them are in memory, and every `refresh` steps new
+    materials replace a block of them.
     """
     sampler = BinSampler(recipe.bins_law, recipe.grid)
     layers = initial_layers(recipe, space)
@@ -94,13 +95,13 @@ def fit_material(
     progress: Callable[[loop.Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Adapter, loop.Run]:
-    """Overfits the table of one material (paper Fig. 4, left)."""
+    """Trains an adapter on the table of one material only (paper Fig. 4, left)."""
     record = {**record, "params": np.asarray(params).ravel().tolist()}
     return train_class(space, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
 
 
 def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[str, Any]) -> Adapter:
-    """The trained adapter with its record."""
+    """The adapter of a training run, with the record of the run."""
     tail = run.log_losses[-1000:]
     training = {
         **record,
@@ -123,7 +124,7 @@ def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[st
 
 
 def record_of(recipe: Recipe, run: loop.Run) -> dict[str, Any]:
-    """What the record of every run says."""
+    """The part of the training record that every run has."""
     return {
         "recipe": asdict(recipe),
         "steps": run.step,
