@@ -13,7 +13,7 @@ from typing import Any
 
 from nma.errors import NmaError, OutputError
 
-# The bytes of a test file. They are needed because a full disk still creates files, and fails only at their bytes.
+# The bytes of a test file. They are needed because on a full disk an empty file can still be created, but not written.
 _TRIAL = bytes(1 << 16)
 _ADVICE = {
     errno.ENOSPC: "free some space, or choose another place",

@@ -132,6 +132,6 @@ def test_a_file_that_is_no_archive_is_refused_without_advice_to_unpickle_it(tmp_
     path = tmp_path / "gold.npz"
     path.write_bytes(content)
     for read in (Tables.load, nbrdf.read):
-        with pytest.raises(NmaError, match=r"gold\.npz: .*it is no \.npz file") as error:
+        with pytest.raises(NmaError, match=r"gold\.npz: .*it is not an \.npz file") as error:
             read(path)
         assert "pickle" not in str(error.value)

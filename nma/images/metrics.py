@@ -40,7 +40,7 @@ def compare_images(
     Args:
         test, reference: (height, width, 3) linear sRGB, finite, of equal shape, at least 11 x 11 for ssim's window.
         ldr_exposure: exposure in stops for ssim and flip_ldr.
-        eps: the eps of mape, smape and mrse.
+        eps: added to the denominators of mape, smape and mrse.
 
     Returns:
         One value for each name in `METRICS`, in that order.

@@ -1,4 +1,4 @@
-"""Source materials as data: named ones shipped with the package, and files of the same format (docs/materials.md)."""
+"""Source materials as data: named materials shipped with the package, and files in their format (docs/materials.md)."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
 # Ranges on which fields of the Principled BRDF are defined; all other fields have 0 .. 1.
 _LIMITS = {
-    "specular": (0.0, 12.0),  # from 12.5 on no index of refraction has such a reflectance
+    "specular": (0.0, 12.0),  # no index of refraction has the reflectance of 12.5 or more
     "anisotropic": (-1e6, 1.0),
     "fade": (-1.0, 1.0),
     "fade_width": (0.0, 1e6),
@@ -216,7 +216,7 @@ def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPL
     n = (len(flat) + 1) // (size + 1)
     if n < 1 or len(flat) != output_size(n, params):
         raise WeightsError(
-            f"{len(flat)} numbers describe no blend: it has {size} per instance, and a weight for all but the last."
+            f"{len(flat)} numbers describe no blend: it needs {size} per instance, and n - 1 weights for n instances."
         )
     instances = tuple(_instance(flat[k * size : (k + 1) * size], params) for k in range(n))
     weights = tuple(flat[n * size :])

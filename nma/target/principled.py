@@ -35,8 +35,8 @@ CLEARCOAT_F0 = 0.04
 
 
 class Principled(NamedTuple):
-    """Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine are the paper's 11
-    numbers.
+    """Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine fields hold the paper's
+    11 numbers.
 
     `anisotropic` stretches the specular lobe along x; `flatness` blends towards the fake subsurface of Burley 2015.
     The whole BRDF fades out around the half vectors whose cosine to the normal is `fade`, over the width `fade_width`;

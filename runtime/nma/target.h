@@ -22,7 +22,8 @@ template <class T> constexpr T SPEC_MARGIN = T(0.009);
 template <class T> constexpr T CLEARCOAT_MARGIN = T(0.005);
 template <class T> constexpr T MIN_ALBEDO = T(0.0001);
 
-// Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine are the paper's 11 numbers.
+// Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine fields hold the paper's 11
+// numbers.
 template <class T>
 struct Principled {
     Vec3<T> base_color;
