@@ -16,10 +16,11 @@ Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
 Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
 Range = Literal["training", "valid"]
 
-# How far beyond a bound a number may lie; where a range is narrower than 1, this share of it. The reason is rounding:
-# textures and other languages keep numbers in single precision, which moves the bounds of our classes by up to 1e-7.
+# A number may exceed a bound by this much, or by this share of the range if the range is narrower than 1. The reason is
+# rounding: textures and other languages keep numbers in single precision, which moves the bounds of our classes by up
+# to 1e-7.
 ROUNDING = 1e-6
-# What to do about a number beyond a range.
+# What the error message advises about a number out of range.
 _ADVICE = {
     "training": ", the range that the adapter was trained on; set `clamp` to move it there",
     "valid": "; take a value in between",

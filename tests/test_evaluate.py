@@ -195,7 +195,7 @@ def test_an_evaluation_is_json_and_says_that_errors_are_estimated():
 @pytest.mark.usefixtures("coarse")
 def test_references_that_cannot_be_compared_are_refused():
     adapter = constant(BLENDS["alpha .1"])
-    with pytest.raises(TableError, match="evaluation wants isotropic tables"):
+    with pytest.raises(TableError, match="evaluation needs isotropic tables"):
         adapters.evaluate(adapter, reference(np.zeros((1, 4, 5, 6, 3), np.float32)))
     with pytest.raises(TableError, match="no material"):
         adapters.evaluate(adapter, reference(np.zeros((0, *ISOTROPIC.shape), np.float32)))

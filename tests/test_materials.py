@@ -139,8 +139,12 @@ def test_a_file_may_hold_values_beyond_the_training_range_of_adapters(material_f
         ("albedo = 0.5", "albedo = { texture = 'x', scale = true }", "scale is True"),
         ("albedo = 0.5", "albedo = '3366ee'", "a colour '#3366ee'"),
         ("albedo = 0.5", "albedo = '#3366e'", "a colour has six digits"),
-        ("eta_top = 1.5", "eta_top = '#3366ee'", "eta_top is no colour"),
-        ('conductor = "Au"', "eta_conductor = '#3366ee'\nk_conductor = 1", "eta_conductor is no colour"),
+        ("eta_top = 1.5", "eta_top = '#3366ee'", "eta_top is .* not a colour"),
+        (
+            'conductor = "Au"',
+            "eta_conductor = '#3366ee'\nk_conductor = 1",
+            "eta_conductor is .* not a colour",
+        ),
         ("[parameters]", "uv_scale = 0\n[parameters]", "uv_scale is 0, but must be above 0"),
         ("[parameters]", "uv_scale = [1]\n[parameters]", "uv_scale is .*, but must be a finite number"),
     ],
@@ -225,7 +229,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_accepted(material_file):
 def test_a_file_that_is_too_large_is_not_read(material_file):
     path = material_file()
     path.write_text("#" * (materials.MAX_BYTES + 1))
-    with pytest.raises(MaterialError, match="1,048,576 bytes are no material file"):
+    with pytest.raises(MaterialError, match="more than 1,048,576 bytes"):
         materials.load(path)
 
 

@@ -224,7 +224,7 @@ class Adapter:
         self._check_material(path)
         if dialect != DIALECT:
             raise WeightsError(
-                f"{path}: written for the Principled dialect '{dialect}', this version evaluates '{DIALECT}'"
+                f"{path}: it is for the Principled dialect '{dialect}', but this version has '{DIALECT}'"
             )
         if self.instances < 1:
             raise WeightsError(f"{path}: a blend of {self.instances} instances; train again")
@@ -235,7 +235,7 @@ class Adapter:
             )
         if self.in_plane and not self.directional:
             raise WeightsError(
-                f"{path}: stretched in the plane of incidence without a direction; train again"
+                f"{path}: lobes stretch in the plane of incidence, but the network gets no direction; train again"
             )
         inputs = encoding.size(self.encoding, self.space, self.directional)
         found = self.layers[0][0].shape[1], self.layers[-1][0].shape[0]

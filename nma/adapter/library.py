@@ -44,7 +44,7 @@ class Library:
             )
         if not self.names or len(set(self.names)) < len(self.names) or self.codes.shape != shape:
             raise WeightsError(
-                f"{len(self.names)} names, which must differ, and codes {self.codes.shape} do not belong together"
+                f"{len(self.names)} names and codes {self.codes.shape} do not belong together, or a name is there twice"
             )
 
     @staticmethod
@@ -91,10 +91,10 @@ class Library:
         shares = np.asarray(weights, np.float64)
         if shares.shape != (len(names),) or not (np.isfinite(shares).all() and (shares >= 0).all()):
             raise ParamError(
-                f"{len(names)} materials want as many weights of at least 0, got {shares.tolist()}"
+                f"{len(names)} materials need as many weights of at least 0, got {shares.tolist()}"
             )
         if not shares.sum() > 0:
-            raise ParamError("the weights of a mixture are all 0; give one of them more")
+            raise ParamError("the weights of a mixture are all 0; make one of them positive")
         codes = np.stack([self.code(name) for name in names])
         return (shares / shares.sum() @ codes).astype(np.float32)
 

@@ -116,7 +116,7 @@ def _header(path: Path, text: str) -> Header:
     for name, hint in get_type_hints(Header).items():
         if not isinstance(getattr(header, name), get_origin(hint) or hint):
             raise WeightsError(
-                f"{path}: its metadata has {getattr(header, name)!r} as '{name}'; copy or train it again"
+                f"{path}: its metadata has a '{name}' of the wrong type, {getattr(header, name)!r}; train it again"
             )
     return header
 

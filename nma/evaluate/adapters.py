@@ -164,7 +164,7 @@ def evaluate(
     """
     if reference.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
-            f"evaluation wants isotropic tables {ISOTROPIC.shape}, the reference has {reference.values.shape[1:]}"
+            f"evaluation needs isotropic tables {ISOTROPIC.shape}, the reference has {reference.values.shape[1:]}"
         )
     if not len(reference.params):
         raise TableError("the reference holds no material")

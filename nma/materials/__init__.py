@@ -118,7 +118,7 @@ def _document(path: Path) -> Mapping[str, Any]:
     """The content of a TOML file."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise MaterialError(f"{path}: more than {MAX_BYTES:,} bytes are no material file")
+            raise MaterialError(f"{path}: not a material file, because it has more than {MAX_BYTES:,} bytes")
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise MaterialError(f"{path}: cannot be read: {error.strerror}") from error
@@ -127,8 +127,8 @@ def _document(path: Path) -> Mapping[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise MaterialError(f"{path} is no material file: its lists or tables nest too deep") from None
-    except ValueError as error:  # of TOML, or of a number that has too many digits
+        raise MaterialError(f"{path} is not a material file: its lists or tables nest too deep") from None
+    except ValueError as error:  # invalid TOML, or a number with too many digits
         hint = "; numbers begin with a digit, 0.05" if _BARE_POINT.search(text) else ""
         raise MaterialError(f"{path} is no TOML file: {one_line(str(error))}{hint}") from error
 
@@ -213,9 +213,7 @@ def _value(given: Any, param: Param, path: Path, uv_scale: float) -> float | tup
 def _colour(given: str, param: Param, path: Path) -> tuple[float, ...]:
     """The linear value of an sRGB colour in hexadecimal digits."""
     if not _is_colour(param):
-        raise MaterialError(
-            f"{path}: {param.name} is no colour, so {_shown(given)} means nothing; give numbers"
-        )
+        raise MaterialError(f"{path}: {param.name} is {_shown(given)}, but it is not a colour; give numbers")
     if not re.fullmatch("#[0-9a-fA-F]{6}", given):
         raise MaterialError(f"{path}: {param.name} is {_shown(given)}; a colour has six digits, as '#3366ee'")
     return tuple(linear([int(given[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]).tolist())

@@ -12,8 +12,8 @@ from nma.ops import Color, Vec3, minimum, select
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 # Mitsuba's BSDFs that call one nested BSDF and return its result.
 _HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
-# Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": powers of the inverse of this number, the
-# root of x^4 = x + 1, spread points evenly over a cube.
+# Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": this number is the root of x^4 = x + 1, and
+# the powers of its inverse spread points evenly over a cube.
 _SPREAD = 1.2207440846057596
 
 
@@ -183,7 +183,7 @@ def _registered() -> list[Any]:
     for number in count(1):
         try:
             bsdf = dr.reinterpret_array(mi.BSDFPtr, mi.UInt32(number))[0]
-        except RuntimeError:  # beyond the last one
+        except RuntimeError:  # there are no more BSDFs
             return found
         if bsdf is not None:
             found.append(bsdf)

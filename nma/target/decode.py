@@ -118,7 +118,7 @@ def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
         _check(p)
     names = [p.name for p in params]
     if "base_color" not in names or len(set(names)) < len(names):
-        raise WeightsError(f"Target parameters {names} want a base_color and each name once.")
+        raise WeightsError(f"Target parameters {names} must have a base_color, and no name twice.")
     return params
 
 
@@ -126,11 +126,11 @@ def _check(p: TargetParam) -> None:
     """Raises `WeightsError` for a parameter that `Principled` does not have, or a range on which it is not defined."""
     size = 3 if p.name == "base_color" else 1
     if p.name not in Principled._fields or type(p.size) is not int or p.size != size:
-        raise WeightsError(f"Target parameter {p} is not one of {Principled._fields} with its size.")
+        raise WeightsError(f"Target parameter {p} has a wrong name or size; names are {Principled._fields}.")
     if type(p.in_plane) is not bool or (p.in_plane and p.name != "anisotropic"):
-        raise WeightsError(f"Target parameter {p} has no plane of incidence.")
+        raise WeightsError(f"Target parameter {p} cannot lie in the plane of incidence.")
     if type(p.low) not in (int, float) or type(p.high) not in (int, float):
-        raise WeightsError(f"Target parameter {p} has a range that is no pair of numbers.")
+        raise WeightsError(f"Target parameter {p} has a range whose ends are not numbers.")
     low, high = limits(p.name)
     scaled = p.scale == "linear" or (p.scale == "log" and p.low > 0)
     if not (scaled and low <= p.low < p.high <= high):

@@ -37,7 +37,7 @@ class Batch(NamedTuple):
     albedo_shift: NDArray[
         np.float32
     ]  # (3, 2, rows) random shifts of the samples that estimate the target's albedo
-    quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to a bin
+    quantum: NDArray[np.float32]  # (rows,) the value that one walk of throughput 1 adds to a bin
 
 
 @dataclass

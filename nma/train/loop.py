@@ -189,7 +189,7 @@ def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] |
         )
     if notes.get("record", {}) != run.record:
         raise NmaError(
-            f"{path} belongs to a run on other data, {notes.get('record')}; delete it, or use those data"
+            f"{path} belongs to a run on other data, {notes.get('record')}; delete it, or use the same data"
         )
     state = jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(x) for x in leaves])
     return Run(state, notes["step"], losses, log_losses, notes["seconds"], notes["scale"], run.record)
