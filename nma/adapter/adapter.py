@@ -199,7 +199,7 @@ class Adapter:
         return Brdf(blend, Plane.of(wi) if self.in_plane else None)
 
     def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
-        """Target parameters (m, n, size) of m materials (m, columns) at n cosines (n,): curves over cos(theta_i).
+        """The target's parameters (m, n, size) of m materials (m, columns) at n cosines (n,).
 
         Raises `ParamError` for anisotropic adapters.
         """

@@ -25,7 +25,7 @@ MIN_COS_T = 0.05
 
 
 def raw(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
-    """The parameters as they are, then cos(theta_i): the paper's input."""
+    """The parameters unchanged, followed by cos(theta_i): the paper's input."""
     return [*columns] if wi is None else [*columns, wi.z]
 
 

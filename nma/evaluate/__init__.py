@@ -1,4 +1,4 @@
-"""How good a model of a material is: figures of adapters against tables, and of one source against another."""
+"""Measures how good a model of a material is: errors of adapters against tables, and of one source against another."""
 
 from nma.evaluate.adapters import Evaluation, evaluate, table_log_loss, tabulate_adapter
 

@@ -162,8 +162,8 @@ class _Recorded:
     In another block the variables of the BRDF may not exist: Dr.Jit records all callables of a virtual call with the
     same arguments, each in a new scope. So `leave` opens a new scope, and `take` succeeds only in that scope. The
     arguments are kept, because Dr.Jit reuses the indices of variables that are freed. A BRDF with derivatives is never
-    kept: the next pass would follow its derivatives to variables that no longer exist. Frozen functions do not look
-    into this class, because they must not find symbolic variables.
+    kept, because the next pass would follow them to variables that no longer exist. Frozen functions do not look into
+    this class, because they must not find symbolic variables.
     """
 
     def __init__(self) -> None:

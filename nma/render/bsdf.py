@@ -23,7 +23,7 @@ def define_base() -> type:
     A subclass defines `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`),
     `mi.traverse` and attributes show them, and `differentiable` says whether derivatives reach them. A subclass calls
     this `__init__` last, after everything that can fail. From then on the BSDF is registered in Dr.Jit, which calls it
-    in all scenes until it is destroyed, and a traceback could keep a failed BSDF alive.
+    in all scenes until it is destroyed. A traceback could keep a BSDF alive whose `__init__` failed.
     """
     import mitsuba
 

@@ -45,8 +45,9 @@ class Measurement(NamedTuple):
 class Agreement(NamedTuple):
     """Result of `zscore_images`.
 
-    `p_values`: (rows, columns, channels) of blocks, two-sided. `level`: smaller p-values reject; it includes Sidak's
-    correction. `passed`: whether no p-value is below `level`. `worst`: (row, column, channel) of the smallest p-value.
+    `p_values`: (rows, columns, channels) of blocks, two-sided. `level`: the test fails for p-values below this level,
+    which includes Sidak's correction. `passed`: whether no p-value is below `level`. `worst`: (row, column, channel) of
+    the smallest p-value.
     """
 
     p_values: Array

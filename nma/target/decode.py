@@ -1,4 +1,4 @@
-"""Converts raw network outputs to a blend, a blend to a flat list of numbers, and both back.
+"""Converts between three forms of a blend: raw network outputs, a `Blend`, and a flat list of numbers.
 
 All lists have the same order: the parameters of instance 1, of instance 2, and so on, then the weights of the blend.
 The parameters' ranges are stored in weights files.

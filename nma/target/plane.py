@@ -23,9 +23,9 @@ class Plane(NamedTuple):
         return Plane(ops.select(tilted, wi.x * inverse, 1.0), ops.select(tilted, wi.y * inverse, 0.0))
 
     def enter(self, v: Vec3) -> Vec3:
-        """`v` in the frame of the plane, where `wi` has the azimuth 0."""
+        """Turns `v` from the local frame to the frame of the plane, where `wi` has the azimuth 0."""
         return Vec3(self.cos_phi * v.x + self.sin_phi * v.y, self.cos_phi * v.y - self.sin_phi * v.x, v.z)
 
     def leave(self, v: Vec3) -> Vec3:
-        """`v`, given in the frame of the plane, in the local frame: the inverse of `enter`."""
+        """Turns `v` from the frame of the plane to the local frame: the inverse of `enter`."""
         return Vec3(self.cos_phi * v.x - self.sin_phi * v.y, self.sin_phi * v.x + self.cos_phi * v.y, v.z)

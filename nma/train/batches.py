@@ -145,11 +145,11 @@ class BinSampler:
         return o, p, 1.0 / (bins * density)
 
     def _mirror_o(self, i: NDArray) -> NDArray:
-        """The bin of theta_o with the mirror direction of the middle of bin `i`."""
+        """The bin of theta_o that contains the mirror direction of the middle of bin `i`."""
         return (2 * i + 1) * self.grid.theta_o // (2 * self.grid.theta_i)
 
     def _mirror_p(self, a: NDArray) -> NDArray:
-        """The bin of phi_o with the mirror direction of the middle of bin `a`."""
+        """The bin of phi_o that contains the mirror direction of the middle of bin `a`."""
         return (2 * a + 1) * self.grid.phi_o // (2 * self.grid.phi_i) + self.grid.phi_o // 2
 
 

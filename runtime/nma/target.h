@@ -402,13 +402,13 @@ inline Plane<T> plane_of(const Vec3<T>& wi) {
     return Plane<T>{select(tilted, wi.x * inverse, T(1.0)), select(tilted, wi.y * inverse, T(0.0))};
 }
 
-// `v` in the frame of the plane, where `wi` has the azimuth 0.
+// Turns `v` from the local frame to the frame of the plane, where `wi` has the azimuth 0.
 template <class T>
 inline Vec3<T> plane_enter(const Plane<T>& self, const Vec3<T>& v) {
     return Vec3<T>{self.cos_phi * v.x + self.sin_phi * v.y, self.cos_phi * v.y - self.sin_phi * v.x, v.z};
 }
 
-// `v`, given in the frame of the plane, in the local frame: the inverse of `enter`.
+// Turns `v` from the frame of the plane to the local frame: the inverse of `enter`.
 template <class T>
 inline Vec3<T> plane_leave(const Plane<T>& self, const Vec3<T>& v) {
     return Vec3<T>{self.cos_phi * v.x - self.sin_phi * v.y, self.sin_phi * v.x + self.cos_phi * v.y, v.z};
