@@ -140,7 +140,7 @@ class Inputs:
 def of_adapter(adapter: Adapter, props: Any) -> Inputs:
     """The inputs of an adapter: the parameters of its class, or none for an adapter of a single material.
 
-    Parameters given to an adapter of a single material must be those of this material. Raises `ParamError`.
+    An adapter of a single material accepts no other material's parameters. Raises `ParamError`.
     """
     import mitsuba as mi
 
@@ -196,7 +196,7 @@ class _Seen:
         """Restores the arrays that were checked last, if there are any."""
         import mitsuba
 
-        mi: Any = mitsuba  # its types do not know this function
+        mi: Any = mitsuba  # its type stubs lack this function
         if self._checked is None:
             return
         if self._number is not None:

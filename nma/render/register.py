@@ -62,7 +62,7 @@ def _add_resource(folder: str) -> None:
     """Puts a folder on Mitsuba's resource path, once."""
     import mitsuba
 
-    mi: Any = mitsuba  # its types do not know this function
+    mi: Any = mitsuba  # its type stubs lack this function
     resources = mi.file_resolver()
     if folder not in [str(path) for path in resources]:
         resources.append(folder)

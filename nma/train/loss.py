@@ -67,7 +67,7 @@ def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
 def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
     """Two independent unbiased estimates of the target's directional albedo, (2, 3, rows), from its own samples.
 
-    Derivatives treat the samples as constants. This makes the derivatives unbiased, too, and no estimate is clipped.
+    Derivatives treat the samples as constants. The derivatives are therefore unbiased, and no estimate is clipped.
     """
     lattice = jnp.asarray(quadrature.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
