@@ -36,10 +36,10 @@ CHEAP = {
     "render": "--size 16 --spp 1",
     "simulate": "--walks 40000",
     "dataset": "--materials 4 --walks 40000",
-    "train": "--steps 50",
+    "train": "--steps 50 --network 1x8",
     "fit": "--steps 50 --network 1x8",
     "principled": "--steps 50",
-    "train-library": "--steps 50",
+    "train-library": "--steps 50 --network 1x8",
     "library encode": "--steps 50",
 }
 # Only users with the measured materials have these files.

@@ -2,7 +2,7 @@
 
     python -m figures.fits.run [--quick] [MATERIAL ...]
 
-Writes fits.json and fits.png beside this file; with --quick, three materials and few walks, to out/figures/fits.
+Writes fits.json and fits.png beside this file; with --quick, one material and few walks, to out/figures/fits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main() -> None:
     parser = common.parser(__doc__)
     parser.add_argument("materials", nargs="*", default=None)
     arguments = parser.parse_args()
-    names = arguments.materials or list(nma.material_names())[: 3 if arguments.quick else None]
+    names = arguments.materials or list(nma.material_names())[: 1 if arguments.quick else None]
     folder = common.results(__file__, arguments.quick)
     walks, reference_walks = (4_000_000, 8_000_000) if arguments.quick else (64_000_000, 128_000_000)
     rows = [fit(name, walks, reference_walks, arguments.quick) for name in names]
