@@ -176,3 +176,12 @@ def test_an_anisotropic_adapter_has_no_curves():
     for call in (lambda: own.numbers(np.zeros((1, 0)), [0.5]), lambda: Curves(own, [])):
         with pytest.raises(ParamError, match="no curves over cos.*call `prepare` with whole directions"):
             call()
+
+
+def test_a_cosine_in_place_of_the_direction_is_refused():
+    """`prepare` once took cosines. The message says how to make a direction of one."""
+    adapter = Adapter.load("layered3-3x32")
+    columns = list(LAYERED3.sample(np.random.default_rng(0), 2).T)
+    for cosine in (0.5, np.array([0.5, 0.6]), mi.Float(0.5)):
+        with pytest.raises(ParamError, match="not a cosine; nma.ops.at_azimuth_0"):
+            adapter.prepare(columns, cosine)

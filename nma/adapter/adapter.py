@@ -177,7 +177,15 @@ class Adapter:
         """The material's BRDF seen from `wi`. `columns` has one Dr.Jit or NumPy array (n,) per column of the class.
 
         `wi` is a unit vector of the local frame. Dr.Jit lanes that are not `active` get a meaningless BRDF.
+        Raises `ParamError` for a cosine in place of `wi`.
         """
+        try:
+            wi.z  # noqa: B018
+        except (AttributeError, RuntimeError):  # Dr.Jit's arrays raise the latter
+            raise ParamError(
+                "prepare takes the view direction wi as an nma.ops.Vec3, not a cosine; "
+                "nma.ops.at_azimuth_0(cos_theta_i) makes one"
+            ) from None
         inputs = encoding.get(self.encoding)(columns, wi if self.directional else None)
         if ops.backend(*columns, wi.z) == "drjit":
             raw = network.forward_lanes(self.layers, inputs, active)
