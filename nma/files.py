@@ -29,16 +29,20 @@ def whole(path: str | Path) -> Iterator[Path]:
         with whole("gold.npz") as file:
             np.savez(file, ...)
 
-    The temporary file has the same suffix as `path`. Missing folders are made. Raises `OutputError` if the file cannot
-    be written.
+    The temporary file has the same suffix as `path`. Missing folders are made. A file that exists keeps its
+    permissions. Raises `OutputError` if the file cannot be written.
     """
     path = Path(path)
-    partial = _partial(path)
+    # A symbolic link stays: the file that it names is replaced.
+    place = Path(os.path.realpath(path))
+    partial = _partial(place.parent / path.name)
     try:
         _check_place(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        place.parent.mkdir(parents=True, exist_ok=True)
         yield partial
-        partial.replace(path)
+        if place.exists():
+            shutil.copymode(place, partial)
+        partial.replace(place)
     except OSError as error:
         raise _refused(path, error) from error
     finally:

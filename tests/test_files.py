@@ -135,3 +135,23 @@ def test_a_file_that_is_no_archive_is_refused_without_advice_to_unpickle_it(tmp_
         with pytest.raises(NmaError, match=r"gold\.npz: .*it is not an \.npz file") as error:
             read(path)
         assert "pickle" not in str(error.value)
+
+
+def test_a_link_stays_and_the_file_that_it_names_is_replaced(tmp_path):
+    real, link = tmp_path / "there" / "real.npz", tmp_path / "link.npz"
+    real.parent.mkdir()
+    real.write_bytes(b"old")
+    link.symlink_to(real)
+    write_bytes(link, b"new")
+    assert link.is_symlink()
+    assert real.read_bytes() == b"new"
+    assert contents(real.parent) == ["real.npz"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o664])
+def test_a_file_keeps_its_permissions(tmp_path, mode):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+    path.chmod(mode)
+    write_bytes(path, b"new")
+    assert path.stat().st_mode & 0o777 == mode
