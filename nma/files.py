@@ -33,8 +33,7 @@ def whole(path: str | Path) -> Iterator[Path]:
     permissions. Raises `OutputError` if the file cannot be written.
     """
     path = Path(path)
-    # A symbolic link stays: the file that it names is replaced.
-    place = Path(os.path.realpath(path))
+    place = _place(path)
     partial = _partial(place.parent / path.name)
     try:
         _check_place(path)
@@ -105,7 +104,8 @@ def try_file(*paths: str | Path) -> None:
     for path in map(Path, paths):
         try:
             _check_place(path)
-            _try_folder(path.parent, path.name)
+            place = _place(path)
+            _try_folder(place.parent, place.name)
         except OSError as error:
             raise _refused(path, error) from error
 
@@ -135,6 +135,11 @@ def _try_folder(folder: Path, *names: str) -> None:
     finally:
         with suppress(OSError):
             trial.unlink(missing_ok=True)
+
+
+def _place(path: Path) -> Path:
+    """Where the file is written: a symbolic link stays, and the file that it names is replaced."""
+    return Path(os.path.realpath(path))
 
 
 def _check_place(path: Path) -> None:

@@ -148,6 +148,17 @@ def test_a_link_stays_and_the_file_that_it_names_is_replaced(tmp_path):
     assert contents(real.parent) == ["real.npz"]
 
 
+def test_the_trial_is_made_where_a_link_leads(tmp_path, monkeypatch):
+    """`try_file` tests the folder that `whole` writes to. For a link, this is the folder of the file it names."""
+    real, link = tmp_path / "there" / "real.npz", tmp_path / "link.npz"
+    real.parent.mkdir()
+    link.symlink_to(real)
+    written = []
+    monkeypatch.setattr(Path, "write_bytes", lambda path, content: written.append(path))
+    try_file(link)
+    assert [path.parent for path in written] == [real.parent]
+
+
 @pytest.mark.parametrize("mode", [0o600, 0o664])
 def test_a_file_keeps_its_permissions(tmp_path, mode):
     path = tmp_path / "a.png"
