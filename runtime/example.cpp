@@ -8,7 +8,8 @@
 #include <random>
 
 // Gold of microfacet width .1 under a red coat of width .02 and index 1.5. CONVENTIONS.md lists the parameters.
-constexpr float RED_GOLD[13] = {.02f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
+constexpr float RED_GOLD[nma::layered3::COLUMNS] = {.02f,  .1f,  1.5f, .14f, .37f, 1.44f, 3.98f,
+                                                    2.38f, 1.6f, .9f,  .3f,  .2f,  .5f};
 
 int main(int count, char** words) {
     if (count != 2) {
@@ -17,7 +18,8 @@ int main(int count, char** words) {
     }
     try {
         const nma::Adapter adapter = nma::Adapter::load(words[1]);
-        if (adapter.parameter_count() != 13) throw nma::Error("this example needs an adapter of the class layered3");
+        if (adapter.parameter_count() != nma::layered3::COLUMNS)
+            throw nma::Error("this example needs an adapter of the class layered3");
         std::mt19937 engine(1);
         std::uniform_real_distribution<float> uniform;
         std::printf("cos(theta_i)   red   green    blue\n");

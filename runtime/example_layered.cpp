@@ -20,7 +20,8 @@ namespace layered = nma::layered;
 using layered::Vec;
 
 // Gold under a red coat: the parameters of the class in CONVENTIONS.md.
-constexpr float GOLD[13] = {.01f, .1f, 1.5f, .14f, .37f, 1.44f, 3.98f, 2.38f, 1.6f, .9f, .3f, .2f, .5f};
+constexpr float GOLD[nma::layered3::COLUMNS] = {.01f,  .1f,  1.5f, .14f, .37f, 1.44f, 3.98f,
+                                                2.38f, 1.6f, .9f,  .3f,  .2f,  .5f};
 // A round lamp of radiance 1. It fills all directions whose cosine to the centre of the lamp is larger than LAMP_COS.
 constexpr float LAMP_COS = .95f;
 constexpr float LAMP_PDF = nma::INV_PI<float> / (2.0f * (1.0f - LAMP_COS));

@@ -70,7 +70,7 @@ private:
     };
 
     static nma::layered::Stack at(const Inputs& inputs, const SurfaceInteraction3f& si) {
-        float numbers[13];
+        float numbers[nma::layered3::COLUMNS];
         inputs.at(si, numbers);
         return nma::layered::Stack::of(numbers);
     }
