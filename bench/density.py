@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 import nma
 import nma.render
 from bench import frames, scenes
+from figures import common
 from nma.render.load import DEFAULT_ADAPTER
 
 SIGMAS = (0.0, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -110,7 +111,7 @@ def plot(seconds: dict[str, Seconds], arguments: argparse.Namespace, path: Path)
         axes.grid(alpha=0.3)
         axes.legend(title="largest to smallest", fontsize="small", loc="upper left")
     figure.axes[0].set_ylabel(f"seconds, {arguments.size} x {arguments.size}, {arguments.spp} spp")
-    frames.common.save_figure(figure, path)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 import nma
 from bench import frames, scenes
+from figures import common
 from nma import network
 from nma.render.load import DEFAULT_ADAPTER
 
@@ -95,7 +96,7 @@ def plot(seconds: dict[str, float], products: dict[str, int], line: tuple[float,
     axes.set(xlabel="multiply-adds of the network", ylabel="seconds of a frame", ylim=(0, None))
     axes.grid(alpha=0.3)
     axes.legend()
-    frames.common.save_figure(figure, path)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from matplotlib.figure import Figure
 import bench.emptycache  # noqa: F401
 from bench import frames, scenes
 from bench.frames import Array, Frames
+from figures import common
 from nma import materials
 from nma.adapter import shipped
 from nma.images.metrics import errors
@@ -199,7 +200,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         panel.grid(alpha=0.3)
         panel.legend()
     panels[0].set_ylabel("expected RMS error of the picture")
-    frames.common.save_figure(figure, path)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 import nma
 from bench import frames, scenes
+from figures import common
 
 # A frame of fewer samples per pixel is rendered more often: CHEAP / samples times for each run.
 CHEAP = 32
@@ -115,7 +116,7 @@ def plot(curves: dict[str, Curve], arguments: argparse.Namespace, path: Path) ->
     left.set(xlabel="samples per pixel", ylabel="mean squared error; variance dotted")
     right.set(xlabel=f"seconds, {arguments.variant}")
     right.legend()
-    frames.common.save_figure(figure, path)
+    common.save_figure(figure, path)
 
 
 def column(curve: Curve, key: str) -> list[float | None]:

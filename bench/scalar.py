@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 import nma
 from bench import frames, scenes
+from figures import common
 
 SCENE = "sphere"
 # Mean time and efficiency of the adapter in the paper's Table 4.
@@ -113,7 +114,7 @@ def plot(rows: list[Figures], scene: str, path: Path) -> None:
     for axes in (left, right):
         axes.grid(alpha=0.3)
     left.legend(fontsize="small")
-    frames.common.save_figure(figure, path)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from matplotlib.figure import Figure
 import nma
 import nma.render
 from bench import frames, scenes
+from figures import common
 from nma.files import write_text
 
 KINDS = ("untextured", "textured")
@@ -51,7 +52,7 @@ def main() -> None:
             of_setting = []
             for seed, subject in enumerate(subjects(kind, arguments)):
                 part = parts / f"{variant}-{scene}-{kind}-{seed}.json"
-                of_setting.append(frames.common.kept(part, partial(compare, subject, scene, seed, arguments)))
+                of_setting.append(common.kept(part, partial(compare, subject, scene, seed, arguments)))
                 advance()
             place = {"renderer": variant, "scene": scene, "material": kind}
             rows += summary(place, of_setting)
@@ -159,7 +160,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         axes.set(title=renderer, ylabel="efficiency over layered")
         axes.grid(axis="y", alpha=0.3)
     figure.axes[0].legend()
-    frames.common.save_figure(figure, path)
+    common.save_figure(figure, path)
 
 
 if __name__ == "__main__":
