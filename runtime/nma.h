@@ -21,8 +21,10 @@
 //     nma/preparation.h  Preparation: all that these functions read; `assemble`, which fills in a blend
 //     nma/brdf.h         Brdf: a blend and its frame, what `prepare` returns
 //     nma/blend.h        Blend: value, density and sample of all lobes; nma/lanes.h computes four instances at once
-//     nma/target.h       Principled: one instance; Plane: the plane of incidence. Generated from Python
-//     nma/classes.h      the parameters of each class, generated; nma/constants.h: constants shared with Python
+//     nma/generated/     printed from Python; never edit it
+//       target.h         Principled: one instance; Plane: the plane of incidence
+//       classes.h        the parameters of each class
+//       constants.h      constants shared with Python
 //     nma/layered.h      the simulated layered material, which no adapter needs
 //     nma/error.h        Error
 #pragma once

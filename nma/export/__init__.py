@@ -5,6 +5,10 @@ from nma.export.cpp import cpp
 from nma.export.shared import shared
 
 # The generated files of `runtime/`, each with the function that returns its content.
-FILES = {"nma/target.h": cpp, "nma/classes.h": classes, "nma/constants.h": shared}
+FILES = {
+    "nma/generated/target.h": cpp,
+    "nma/generated/classes.h": classes,
+    "nma/generated/constants.h": shared,
+}
 
 __all__ = ["FILES"]

@@ -11,7 +11,7 @@ _HEAD = """\
 // The parameters of each class, with the ranges that its source accepts. The training ranges are in weights files.
 #pragma once
 
-#include "weights.h"
+#include "../weights.h"
 
 namespace nma {
 """

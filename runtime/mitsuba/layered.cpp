@@ -10,7 +10,7 @@
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/shape.h>
 
-#include "nma/classes.h"
+#include "nma/generated/classes.h"
 #include "nma/layered.h"
 #include "source_bsdf.h"
 

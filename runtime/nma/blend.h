@@ -4,8 +4,8 @@
 // Directions are unit vectors in the local frame, z up, `wi` towards the viewer and `wo` towards the light.
 #pragma once
 
+#include "generated/target.h"
 #include "lanes.h"
-#include "target.h"
 
 namespace nma {
 

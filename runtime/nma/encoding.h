@@ -2,10 +2,10 @@
 // size. Twin of nma/adapter/encoding.py.
 #pragma once
 
-#include "constants.h"
+#include "generated/constants.h"
+#include "generated/target.h"
 #include "kernels/macros.h"
 #include "lanes.h"
-#include "target.h"
 #include "weights.h"
 
 namespace nma {

@@ -12,8 +12,8 @@
 #include <utility>
 #include <vector>
 
-#include "constants.h"
 #include "error.h"
+#include "generated/constants.h"
 
 namespace nma {
 

@@ -1,5 +1,5 @@
-// Four numbers side by side. The functions of target.h take `Lanes<T>` in place of T, and so evaluate four instances at
-// once.
+// Four numbers side by side. The functions of generated/target.h take `Lanes<T>` in place of T, and so evaluate four
+// instances at once.
 //
 // With GCC and Clang, four floats are a vector of the instructions that every CPU of the target has. Four doubles, and
 // four floats with other compilers, are loops over an array.

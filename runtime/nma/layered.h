@@ -8,8 +8,8 @@
 
 #include <cstdint>
 
-#include "constants.h"
-#include "target.h"
+#include "generated/constants.h"
+#include "generated/target.h"
 
 namespace nma::layered {
 

@@ -1,4 +1,5 @@
-// The arithmetic of target.h: scalars of type T, which is float, double or `Lanes` (lanes.h), and vectors of three.
+// The arithmetic of generated/target.h: scalars of type T, which is float, double or `Lanes` (lanes.h), and vectors of
+// three.
 #pragma once
 
 #include <algorithm>

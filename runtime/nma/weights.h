@@ -9,9 +9,9 @@
 #include <fstream>
 #include <tuple>
 
-#include "constants.h"
+#include "generated/constants.h"
+#include "generated/target.h"
 #include "json.h"
-#include "target.h"
 
 namespace nma {
 

@@ -6,7 +6,7 @@
 #include <cstdio>
 #include <cstdlib>
 
-#include "nma/classes.h"
+#include "nma/generated/classes.h"
 #include "nma/layered.h"
 #include "random.h"
 

@@ -3,7 +3,7 @@
 // The parameters of each class, with the ranges that its source accepts. The training ranges are in weights files.
 #pragma once
 
-#include "weights.h"
+#include "../weights.h"
 
 namespace nma {
 
