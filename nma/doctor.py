@@ -48,9 +48,10 @@ SYSTEM_PACKAGES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check: whether it is `ok`, what was `found`, and a command as `fix` ("" if it is ok).
+    """The result of one check: whether the checked item is `ok`, and what was `found`.
 
-    An `optional` part adds a feature, which `found` names. The package runs without it.
+    `fix` is the command that repairs a fault, or "" if there is none. If `optional` is true, the package runs without
+    the checked item, and `found` names the feature that is then missing.
     """
 
     name: str
@@ -61,9 +62,9 @@ class Finding:
 
 
 def check() -> list[Finding]:
-    """Checks everything the package needs. Starts no kernel, and changes no setting other than DRJIT_LIBLLVM_PATH.
+    """Checks everything the package needs. Compiles nothing, and changes no setting other than DRJIT_LIBLLVM_PATH.
 
-    Fix the findings in their order, since a later one may depend on an earlier one.
+    Repair the faults in the order of the findings, since a later finding may be a consequence of an earlier one.
     """
     needed = {"drjit": "", "mitsuba": "", "numpy": "", "safetensors": "", "zarr": "", "matplotlib": ""}
     needed["PIL"] = "pillow"
@@ -71,7 +72,7 @@ def check() -> list[Finding]:
         _system(),
         _python(),
         *([_libatomic()] if sys.platform == "linux" else []),
-        _llvm(),  # before the modules, as Dr.Jit looks for libLLVM when it is imported
+        _llvm(),  # precedes `_module`, because Dr.Jit looks for libLLVM when it is imported
         *(_module(name, distribution=distribution) for name, distribution in needed.items()),
         _cuda(),
         *(_module(name, "training") for name in ("jax", "optax")),
@@ -89,7 +90,7 @@ def _advice(what: str) -> str:
 
 
 def _system() -> Finding:
-    """Whether the operating system is supported. All tests run on Linux."""
+    """Checks whether the operating system is supported. All tests of this package run on Linux."""
     system = llvm.platform()
     if system == "windows":
         return Finding("system", False, "Windows is not supported; use Linux in WSL", llvm.install_command())
@@ -128,12 +129,13 @@ def _llvm() -> Finding:
 def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
     """Checks that the module `name` can be imported.
 
-    A module with a `purpose` is optional. `distribution` is the module's name for pip, if it differs.
+    A module that has a `purpose` is optional. `distribution` is the name that pip uses for the module, if it differs
+    from `name`.
     """
     distribution = distribution or name
     try:
         importlib.import_module(name)
-    except Exception as error:  # a missing shared library need not raise an ImportError
+    except Exception as error:  # a missing shared library may raise another exception than ImportError
         found = f"for {purpose}; not installed" if purpose else f"cannot be imported: {error}"
         fix = f"{sys.executable} -m pip install '{_requirement(distribution)}'"
         return Finding(name, False, found, fix, bool(purpose))
@@ -141,7 +143,7 @@ def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
 
 
 def _requirement(distribution: str) -> str:
-    """The requirement of this package for a distribution, with its versions, such as "mitsuba==3.9.*"."""
+    """The line of this package's requirements that names `distribution` and its versions, such as "mitsuba==3.9.*"."""
     try:
         wanted = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:

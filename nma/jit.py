@@ -1,8 +1,8 @@
-"""Dr.Jit, loaded with a libLLVM that is new enough. All modules of this package import `dr` from here.
+"""Imports Dr.Jit with a libLLVM that is new enough. All modules of this package import `dr` from this module.
 
-Dr.Jit chooses its libLLVM when it is first imported. A libLLVM that is too old kills the process at the first kernel,
-so this module chooses one before it imports Dr.Jit. If there is no usable libLLVM and no GPU for Dr.Jit, importing this
-module raises `MissingDependencyError`.
+Dr.Jit loads a libLLVM when it is first imported. A libLLVM that is too old kills the process when the first kernel is
+compiled, so this module chooses a new libLLVM before it imports Dr.Jit. If there is no usable libLLVM and no GPU for
+Dr.Jit, importing this module raises `MissingDependencyError`.
 """
 
 import ctypes
@@ -17,7 +17,8 @@ __all__ = ["dr"]
 def _has_gpu() -> bool:
     """Whether Dr.Jit can run on a GPU and so needs no libLLVM.
 
-    Looks for a driver first, because importing Dr.Jit without libLLVM prints a warning to stderr.
+    This function looks for a driver before it imports Dr.Jit, because importing Dr.Jit without libLLVM prints a warning
+    to stderr.
     """
     try:
         ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")

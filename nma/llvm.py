@@ -1,9 +1,9 @@
 """Finds a libLLVM with which Dr.Jit can compile CPU kernels.
 
 An old libLLVM raises no error: it kills the process while Dr.Jit compiles a kernel ("LLVM ERROR: Cannot select"). So
-this module looks for the newest libLLVM of the system, and refuses an old one before Dr.Jit loads it.
+this module looks for the newest libLLVM of the system, and raises an error before Dr.Jit loads an old one.
 
-The file needs only the standard library. It can be run before anything is installed: `python3 -I nma/llvm.py`.
+This file needs only the standard library, so `python3 -I nma/llvm.py` can be run before anything is installed.
 """
 
 import ctypes
@@ -16,12 +16,14 @@ import sys
 from functools import cache
 from pathlib import Path
 
-# With AVX-512, Dr.Jit 1.5 aborts in libLLVM 15 and 16 (at `fmaximum`). 17, 18, 19 and 22 rendered the same picture.
+# On CPUs with AVX-512, Dr.Jit 1.5 aborts in libLLVM 15 and 16 (at `fmaximum`). With libLLVM 17, 18, 19 and 22 it
+# rendered identical pictures.
 MIN_VERSION = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 NEED = f"Dr.Jit needs {MIN_VERSION} or later to compile for the CPU"
 
-# Where distributions install libLLVM outside the search path of the dynamic linker.
+# The places outside the search path of the dynamic linker where Linux distributions and macOS package managers install
+# libLLVM.
 PATTERNS = (
     "/usr/lib/*-linux-gnu/libLLVM*",
     "/usr/lib/llvm*/lib*/libLLVM*",
@@ -44,13 +46,14 @@ _INSTALL = {
     "fedora": "sudo dnf install llvm-libs",
     "arch": "sudo pacman -S llvm-libs",
     "macos": "brew install llvm",
-    # Dr.Jit could use LLVM-C.dll there, but this package was never tried on Windows.
+    # Dr.Jit could use LLVM-C.dll on Windows, but this package was never tried there.
     "windows": "wsl --install (Windows is not supported, so use Linux in WSL)",
 }
 
 
 def platform() -> str:
-    """The system, by its package manager: debian (includes Ubuntu), fedora, arch, macos, windows or other."""
+    """The name of the system, which decides the package manager: debian (includes Ubuntu), fedora, arch, macos, windows
+    or other."""
     if sys.platform in ("darwin", "win32"):
         return "macos" if sys.platform == "darwin" else "windows"
     try:
@@ -70,7 +73,8 @@ def install_command() -> str:
 def version(path: str) -> int | None:
     """The major version of the libLLVM at `path`.
 
-    It is 0 if the libLLVM is too old to tell its version (before 16), and None if it cannot be loaded.
+    The version is 0 if the libLLVM is too old to tell its version (before 16), and None if the libLLVM cannot be
+    loaded.
     """
     try:
         library = ctypes.CDLL(path)
@@ -86,13 +90,13 @@ def version(path: str) -> int | None:
 
 
 def _version_of_name(path: str) -> int:
-    """The major version in the resolved path of the file, or 0 if the path states none."""
+    """The major version in the resolved path of the file, or 0 if the path contains no version."""
     numbers = _NUMBER.findall(os.path.realpath(path))
     return int(numbers[-1]) if numbers else 0
 
 
 def _folders_of_user() -> list[str]:
-    """The folders that environment variables add to the search."""
+    """The folders that environment variables add to the search for libLLVM."""
     variables = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH")
     folders = [folder for name in variables for folder in os.environ.get(name, "").split(os.pathsep)]
     prefix = os.environ.get("CONDA_PREFIX")
@@ -113,7 +117,8 @@ def candidates() -> list[str]:
 
 @cache
 def _examine(path: str) -> tuple[int | None, str]:
-    """The version of the libLLVM at `path`, and a sentence on its fault ("" if it is usable)."""
+    """The version of the libLLVM at `path`, and a message that says why this libLLVM is unusable ("" if it is
+    usable)."""
     found = version(path)
     if found is None:
         return None, f"{path} is no libLLVM that can be loaded"
@@ -125,7 +130,7 @@ def _examine(path: str) -> tuple[int | None, str]:
 
 @cache
 def _newest() -> tuple[str, int, str]:
-    """The path and the version of the newest libLLVM that can be loaded, and a sentence on its fault ("" if none)."""
+    """The path and the version of the newest libLLVM that can be loaded, and the message of `_examine`."""
     for path in candidates():
         found, fault = _examine(path)
         if found is not None:
@@ -136,8 +141,8 @@ def _newest() -> tuple[str, int, str]:
 def find() -> tuple[str, int]:
     """The path and the major version of the libLLVM to use.
 
-    This is the file that DRJIT_LIBLLVM_PATH names, or else the newest on the system. Raises `MissingDependencyError`,
-    which says what to do, if there is none or it is too old.
+    The libLLVM that DRJIT_LIBLLVM_PATH names takes precedence over the newest libLLVM on the system. Raises
+    `MissingDependencyError`, whose message says what to do, if there is no libLLVM or if it is too old.
     """
     if chosen := os.environ.get(VARIABLE):
         found, fault = _examine(chosen)
@@ -154,9 +159,9 @@ def find() -> tuple[str, int]:
 def ensure_llvm() -> None:
     """Makes sure that Dr.Jit uses a libLLVM that is new enough. Call this function before the first CPU kernel.
 
-    The first import of Dr.Jit loads libLLVM. Before that import, this function sets DRJIT_LIBLLVM_PATH, unless
-    the user has set it. After the import, it asks Dr.Jit which libLLVM is loaded. Raises `MissingDependencyError` if
-    there is no usable libLLVM, or if Dr.Jit has loaded one that is too old.
+    The first import of Dr.Jit loads libLLVM. If Dr.Jit is not yet imported, this function sets DRJIT_LIBLLVM_PATH,
+    unless the user has set it. If Dr.Jit is already imported, this function asks Dr.Jit which libLLVM is loaded. Raises
+    `MissingDependencyError` if there is no usable libLLVM, or if Dr.Jit has loaded one that is too old.
     """
     if "drjit" in sys.modules:
         _check_loaded()
@@ -167,7 +172,7 @@ def ensure_llvm() -> None:
 def _check_loaded() -> None:
     import drjit
 
-    major = drjit.detail.llvm_version()[0]  # -1 if Dr.Jit has found no libLLVM
+    major = drjit.detail.llvm_version()[0]  # `major` is -1 if Dr.Jit has found no libLLVM
     if major >= MIN_VERSION:
         return
     loaded = f"libLLVM {major}, which is too old ({NEED})" if major > 0 else "no libLLVM"
@@ -177,14 +182,14 @@ def _check_loaded() -> None:
 
 
 def _missing(message: str) -> Exception:
-    # Imported only here, because this file must run before the package is installed.
+    # The import is inside this function, because this file must run before the package is installed.
     from nma.errors import MissingDependencyError
 
     return MissingDependencyError(message)
 
 
 def main() -> int:
-    """Prints the path of the libLLVM in use and returns 0, or prints what is wrong and returns 1."""
+    """Prints the path of the libLLVM to use and returns 0, or prints why there is no usable libLLVM and returns 1."""
     chosen = os.environ.get(VARIABLE)
     path, fault = (chosen, _examine(chosen)[1]) if chosen else (_newest()[0], _newest()[2])
     print(fault or path)

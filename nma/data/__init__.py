@@ -15,7 +15,7 @@ class Conductors:
     """Complex indices of refraction eta + i k of real conductors, in linear sRGB.
 
     `names` has n entries. `eta` (.038 .. 7.51) and `k` (.114 .. 9.22) are (n, 3) float64, unitless. `held_out` is (n,)
-    bool, true for the metals that training never sees. The arrays are read-only.
+    bool, true for the metals that are excluded from training. The arrays are read-only.
     """
 
     names: tuple[str, ...]
@@ -27,14 +27,15 @@ class Conductors:
         return len(self.names)
 
     def distinct(self) -> np.ndarray:
-        """The numbers of the rows without duplicates, ascending: some substances are in the table twice."""
+        """The indices of the distinct rows, ascending. Some substances are in the table twice, under two names."""
         _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
         return np.sort(first)
 
 
 @cache
 def load_conductors() -> Conductors:
-    """The metals of `conductors.csv`, in file order. tools/make_conductors.py made it from Mitsuba's data/ior."""
+    """The metals of `conductors.csv`, in file order. tools/make_conductors.py wrote that file from Mitsuba's
+    data/ior."""
     lines = files(__name__).joinpath("conductors.csv").read_text(encoding="utf-8").splitlines()
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
 

@@ -1,10 +1,10 @@
-"""The target in other languages, printed from the Python functions that define it: `python -m nma.export`."""
+"""Exports the target: as C++ headers, generated from the Python functions that define it, and as Mitsuba BSDFs."""
 
 from nma.export.classes import classes
 from nma.export.cpp import cpp
 from nma.export.shared import shared
 
-# The generated files of `runtime/`, each with the function that returns its content.
+# Each generated file of `runtime/`, and the function that returns the content of the file.
 FILES = {
     "nma/generated/target.h": cpp,
     "nma/generated/classes.h": classes,

@@ -15,7 +15,7 @@ _HEAD = """\
 
 namespace nma {
 """
-# The number that stands for an infinite bound.
+# In C++, this value stands for an infinite bound of a range.
 _UNBOUNDED = 1e30
 
 
@@ -32,7 +32,7 @@ def classes() -> str:
 
 
 def _simulated() -> list[tuple[str, ParamSpace]]:
-    """The names and the parameters of the classes that have a source."""
+    """The names and the parameters of the classes whose appearance a source of this package simulates."""
     return [(name, SPACES[name]) for name in sources.names()]
 
 

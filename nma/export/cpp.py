@@ -1,7 +1,7 @@
 """The header `target.h` of the C++ runtime: for each exported Python function, one C++17 function template.
 
-A template has the name of its Python function, and the first paragraph of the docstring as its comment. Its parameter T
-is the number type.
+A template has the name of its Python function, and the first paragraph of the docstring as its comment. The template
+parameter T is the type of the numbers.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _structure(name: str, doc: str, fields: list[tuple[str, str]]) -> str:
 
 
 def _fields() -> str:
-    """The table of the fields of `Principled`, which a reader of weights files looks up by name."""
+    """The C++ table of the fields of `Principled`. The code that reads weights files looks up the fields by name."""
     return "\n".join([_FIELDS, *(_field(name, kind) for name, kind in fields(Principled)), "};", ""])
 
 
@@ -89,7 +89,8 @@ def print_function(function: Function) -> str:
 
 
 def _line(function: Function, node: ast.stmt) -> str:
-    """The C++ statement on one line. A longer one is broken as clang-format would do: after its `=`, or in its list."""
+    """The C++ statement. If it is too long for one line, it is broken as clang-format would break it: after the `=`, or
+    between the items of the list."""
     statement = _statement(function, node)
     name, assigns, value = statement.partition(" = ")
     if 4 + len(statement) <= _WIDTH:
@@ -105,7 +106,7 @@ def _line(function: Function, node: ast.stmt) -> str:
 
 
 def _filled(head: str, items: list[str]) -> str:
-    """A list in braces that fills its lines; each line begins below the first item."""
+    """A list in braces. Each line has as many items as fit, and starts in the column of the first item."""
     lines = [head + items[0]]
     for item in items[1:]:
         if len(lines[-1]) + len(f", {item},") <= _WIDTH:
@@ -151,7 +152,7 @@ def _statement(function: Function, node: ast.stmt) -> str:
 
 
 def _expression(function: Function, node: ast.expr, tightness: int = 0) -> str:
-    """The C++ expression, in parentheses if its operator binds less tightly than `tightness`."""
+    """The C++ expression. It is in parentheses if the precedence of its operator is lower than `tightness`."""
     match node:
         case ast.Constant(value=int() | float() as number):
             return f"T({number!r})"

@@ -1,8 +1,8 @@
 """The functions, structures and constants of the target, as syntax trees.
 
 A function comes after all functions that it calls. The functions use only what every shading language has: assignments
-of expressions to names, arithmetic, comparisons, calls, fields, and one return at the end. Anything else raises an
-error with its file and line.
+of expressions to names, arithmetic, comparisons, calls, access to the fields of structures, and one return at the end.
+Any other construct raises an error that names its file and line.
 """
 
 from __future__ import annotations
@@ -84,20 +84,21 @@ class Function:
     def unsupported(
         self, node: ast.AST, what: str, remedy: str = "write it with arithmetic and `ops`"
     ) -> Unsupported:
-        """The error for a construct that cannot be exported, with its file and line."""
+        """The error for a construct that cannot be exported. The message names the file and the line of the
+        construct."""
         place = f"{self.module.__file__}:{getattr(node, 'lineno', '?')}"
         return Unsupported(f"{place}: {what} cannot be exported; {remedy}")
 
 
 @cache
 def functions() -> tuple[Function, ...]:
-    """All of `FUNCTIONS`, parsed."""
+    """The syntax trees of all functions in `FUNCTIONS`."""
     return tuple(parsed(function) for function in FUNCTIONS)
 
 
 @cache
 def constants() -> dict[str, float]:
-    """The global numbers that the functions use, by name."""
+    """The names and the values of the global constants that the functions use."""
     found = {}
     for function in functions():
         for name in _names(function):
@@ -126,7 +127,7 @@ def _names(function: Function) -> list[str]:
 
 
 def parsed(function: Callable) -> Function:
-    """Parses a function. The nodes of its syntax tree have the line numbers of the file."""
+    """Parses a function. The nodes of the syntax tree have the line numbers of the source file."""
     lines, first = inspect.getsourcelines(function)
     tree = ast.parse(textwrap.dedent("".join(lines))).body[0]
     ast.increment_lineno(tree, first - 1)
@@ -134,7 +135,7 @@ def parsed(function: Callable) -> Function:
     assert isinstance(tree, ast.FunctionDef)
     owner, _, _ = function.__qualname__.rpartition(".")
     name = f"{owner.lower()}_{tree.name}" if owner else tree.name
-    # `self` has no annotation.
+    # Because `self` has no annotation, it gets the name of its class as its type.
     arguments = [(a.arg, ast.unparse(a.annotation) if a.annotation else owner) for a in tree.args.args]
     body = tree.body[1:] if ast.get_docstring(tree) else tree.body
     returns = ast.unparse(tree.returns) if tree.returns else ""

@@ -1,4 +1,4 @@
-"""A Principled BRDF as a description of Mitsuba's own plugin `principled`: a dictionary for `mi.load_dict`, or XML."""
+"""Describes a Principled BRDF for Mitsuba's own plugin `principled`: as a dictionary for `mi.load_dict`, or as XML."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from typing import Any
 from nma.errors import ParamError
 from nma.target.principled import Principled, specular_eta
 
-# The parameters, which have the same names in Mitsuba. `specular` may be replaced by `eta`.
+# The parameters that have the same names in Mitsuba. `principled_dict` may replace `specular` by `eta`.
 _FIELDS = (
     *("roughness", "metallic", "specular", "spec_tint", "sheen", "sheen_tint"),
     *("clearcoat", "clearcoat_gloss", "anisotropic", "flatness"),
 )
-# The number of significant digits. Mitsuba reads numbers in single precision, which has about as many.
+# The number of significant digits that are written. Mitsuba reads numbers in single precision, which holds about 7
+# digits.
 _DIGITS = 7
-# A dielectric without reflection gets this `eta`, and a `specular` below this minimum counts as 0. With an eta of 1,
-# Mitsuba 3.9 would leave out the reflection of metals, too.
+# A `specular` below _MIN_SPECULAR counts as 0, which is a dielectric without reflection. Its `eta` is set to _MIN_ETA
+# instead of 1, because Mitsuba 3.9 leaves out the reflection of metals, too, if `eta` is 1.
 _MIN_SPECULAR, _MIN_ETA = 1e-6, 1.00001
 
 
 def principled_dict(p: Principled) -> dict[str, Any]:
-    """The dictionary for `p`, whose parameters are plain numbers.
+    """The dictionary that describes `p`. The parameters of `p` must be plain numbers.
 
-    The BSDF is one-sided, as Mitsuba's plugin is without `spec_trans`. Wrap it in `twosided` for surfaces seen from
-    behind. The plugin returns the same values as `nma.target.eval_principled`, with the exceptions listed at the top of
+    Without `spec_trans`, Mitsuba's plugin is one-sided. Wrap the BSDF in `twosided` for surfaces seen from behind. The
+    plugin returns the same values as `nma.target.eval_principled`, with the exceptions listed at the top of
     nma/target/principled.py.
 
-    In two cases `specular` is replaced by the `eta` with the same reflectance: above 1, which is Mitsuba's limit, and
-    at 0, where Mitsuba would leave out the reflection of metals. Raises `ParamError` for parameters that the plugin
-    does not have, and for values that it does not allow.
+    `specular` is replaced by the `eta` with the same reflectance in two cases: if `specular` is above 1, which is
+    Mitsuba's limit, and if it is 0, for which Mitsuba leaves out the reflection of metals. Raises `ParamError` for
+    parameters that the plugin does not have, and for values that it does not allow.
     """
     values = {name: float(getattr(p, name)) for name in _FIELDS}
     base_color = [float(c) for c in p.base_color]
@@ -37,7 +38,7 @@ def principled_dict(p: Principled) -> dict[str, Any]:
     if used := sorted(name for name in unknown if float(getattr(p, name)) != 0.0):
         raise ParamError(f"Mitsuba's principled has no {', '.join(used)}; set it to 0")
     for name, value in (*values.items(), *(("base_color", c) for c in base_color)):
-        # No index of refraction has a `specular` of 12.5 or more.
+        # `specular` is 12.5 for an infinite index of refraction, so values from 12.5 on have no `eta`.
         high = 12.0 if name == "specular" else 1.0
         if not 0.0 <= value <= high:
             raise ParamError(f"{name} is {value:g}, Mitsuba's principled allows 0 .. {high:g}")
@@ -60,7 +61,7 @@ def principled_xml(p: Principled) -> str:
 
 
 def principled_json(p: Principled) -> str:
-    """The dictionary as a JSON file."""
+    """`principled_dict` as the text of a JSON file."""
     return json.dumps(principled_dict(p), indent=2) + "\n"
 
 

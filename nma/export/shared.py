@@ -14,7 +14,7 @@ _HEAD = """\
 
 namespace nma {
 """
-# The modules and their constants. A constant has the same name in both languages.
+# Each module, and the names of its constants. A constant has the same name in C++ as in Python.
 _GENERAL = (
     (principled, ("DIALECT",)),
     (weights, ("FORMAT", "MAX_DEPTH")),

@@ -1,1 +1,1 @@
-"""The C++ runtime from Python: `build` compiles it, `runtime` calls it."""
+"""Compiles the C++ runtime (`build`) and calls it from Python (`runtime`)."""

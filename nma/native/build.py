@@ -1,10 +1,11 @@
 """Compiles the C++ runtime on this machine: the plugins for Mitsuba's scalar renderer, and the shared library that
 `nma.native.runtime` calls.
 
-The compiled files are kept in the user's cache, in a subfolder whose name has a digest of the C++ sources and of the
-versions that they are compiled against. So they are compiled again after an update of this package or of Mitsuba, and
-files that do not fit are never loaded. The compiler is the one named in `CXX`, else c++, g++ or clang++. Linux is
-tested, macOS should work, and Windows is refused.
+The compiled files are kept in the user's cache, in a subfolder whose name contains a digest of the C++ sources and of
+the versions of the packages that the plugins link to. So the C++ sources are compiled again after an update of this
+package or of Mitsuba, and plugins of another version are never loaded. The compiler is the first that exists of the one
+named in `CXX`, c++, g++ and clang++. This module is tested on Linux, should work on macOS, and raises an error on
+Windows.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from nma.files import whole_folder
 
 PLUGINS = ("nma", "layered")
 _ADAPTERS = Path(__file__).parent.parent / "adapter" / "trained"
-# The flags with which Mitsuba's wheel was compiled. The instruction set decides how function calls pass vectors: with
-# another instruction set, a plugin loads, but returns nonsense.
+# The flags with which Mitsuba's wheel was compiled. The instruction set decides how function calls pass vectors, so a
+# plugin that is compiled for another instruction set loads, but returns wrong values.
 _MITSUBA_FLAGS = (
     *(["-march=haswell"] if platform.machine() in ("x86_64", "AMD64") else []),
     *("-std=c++20", "-O2", "-fPIC", "-shared", "-fvisibility=hidden"),
@@ -36,7 +37,7 @@ _MITSUBA_FLAGS = (
 
 
 class BuildError(NmaError, RuntimeError):
-    """The compiler failed. The message has its first errors."""
+    """The compiler failed. The message contains the first two errors of the compiler."""
 
 
 def sources() -> Path:
@@ -49,12 +50,13 @@ def sources() -> Path:
 
 
 def mitsuba_folder() -> Path:
-    """The folder of the plugins for the installed Mitsuba, to be put on its resource path. It may not exist yet."""
+    """The folder of the plugins for the installed Mitsuba, to be put on Mitsuba's resource path. The folder does not
+    exist until `build_mitsuba` has run."""
     return _cache() / f"mitsuba-{_digest('mitsuba', 'drjit')}"
 
 
 def has_mitsuba_plugins() -> bool:
-    """Whether the plugins for the installed Mitsuba are compiled."""
+    """Whether the plugins have been compiled for the installed Mitsuba."""
     return mitsuba_folder().exists()
 
 
@@ -65,7 +67,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         say: a function that is called with a line of text for each step.
 
     Returns:
-        The folder to put on Mitsuba's resource path. The folder also has the shipped adapters.
+        The folder to put on Mitsuba's resource path. The folder also contains the shipped adapters.
 
     Raises:
         MissingDependencyError: there is no compiler, or no nanobind, whose headers Dr.Jit's headers include.
@@ -92,16 +94,17 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         for name in PLUGINS:
             plugin = into / "plugins" / f"{name}{_suffix()}"
             say(f"compiling {plugin.name}")
-            # The flags come last: the linker looks for a file's symbols in the libraries named after it.
+            # The flags come last, because the linker looks for a file's symbols only in the libraries that are named
+            # after the file.
             _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", plugin], flags)
         shutil.copytree(_ADAPTERS, into / "adapters")
     return folder
 
 
 def shared_library() -> Path:
-    """The path of the shared library of the C interface, which is compiled if it does not exist.
+    """The path of the shared library of the C interface. This function compiles the library if it does not exist.
 
-    Raises the errors of `build_mitsuba`.
+    Raises the same errors as `build_mitsuba`.
     """
     folder, name = _cache() / f"library-{_digest()}", f"nma_c{_suffix()}"
     flags = ["-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", f"-I{sources()}"]
@@ -112,7 +115,8 @@ def shared_library() -> Path:
 
 
 def compiler() -> str:
-    """The path of the C++ compiler. Raises `MissingDependencyError` if there is none, and `BuildError` on Windows."""
+    """The path of the C++ compiler. Raises `MissingDependencyError` if there is no compiler, and `BuildError` on
+    Windows."""
     if sys.platform == "win32":
         raise BuildError(
             "the C++ runtime cannot be compiled on Windows, but on Linux and (untested) on macOS; use WSL, or the "
@@ -127,12 +131,13 @@ def compiler() -> str:
 
 
 def _suffix() -> str:
-    """The file extension of a shared library, which is also that of Mitsuba's plugins."""
+    """The file extension of shared libraries and of Mitsuba's plugins."""
     return ".dylib" if sys.platform == "darwin" else ".so"
 
 
 def _leave_undefined() -> str:
-    """The linker flag that allows undefined symbols in Mitsuba's libraries, which are resolved when a plugin loads."""
+    """The linker flag that allows Mitsuba's libraries to have undefined symbols, which are resolved when a plugin
+    loads."""
     return "-Wl,-undefined,dynamic_lookup" if sys.platform == "darwin" else "-Wl,--allow-shlib-undefined"
 
 
@@ -145,7 +150,7 @@ def _compile(words: Sequence[str | Path], flags: Sequence[str]) -> None:
 
 
 def _package(name: str) -> Path:
-    """The folder of an installed package."""
+    """The folder of the installed package `name`."""
     try:
         return Path(str(importlib.metadata.distribution(name).locate_file(name)))
     except importlib.metadata.PackageNotFoundError:
@@ -161,7 +166,8 @@ def _cache() -> Path:
 
 @cache
 def _digest(*packages: str) -> str:
-    """A digest of the C++ sources; with `packages`, also of the shipped adapters and of the packages' versions."""
+    """A digest of the C++ sources. If `packages` are given, the digest also covers their versions and the shipped
+    adapters."""
     digest = hashlib.sha256()
     folders = (sources(), _ADAPTERS) if packages else (sources(),)
     for file in sorted(f for folder in folders for f in folder.rglob("*") if f.is_file()):

@@ -1,13 +1,13 @@
-"""The C++ runtime from Python, for many queries at once. Its shared library is compiled when it is first used.
+"""Calls the C++ runtime from Python for many queries at once. Its shared library is compiled on the first call.
 
     runtime = nma.native.runtime.Runtime("layered3-5x64")
     brdfs = runtime.prepare(params, wi)                        # (n, 13) in the training range, (n, 3)
     value, pdf = runtime.eval_pdf(brdfs, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
     wo, value, pdf = runtime.sample(brdfs, wi, u)
 
-Directions are unit vectors (n, 3) in the local frame, with z up; `wi` points towards the viewer. Call `eval_pdf` and
-`sample` with the `wi` of `prepare`. For isotropic adapters a `wi` with the same cosine is enough. All arrays are
-converted to float32.
+Directions are unit vectors (n, 3) in the local frame, with z up. `wi` points towards the viewer. Call `eval_pdf` and
+`sample` with the `wi` that `prepare` got. If the adapter is isotropic, `wi` may have another azimuth, but must have the
+same cosine with the normal. All arrays are converted to float32.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from nma.native import build
 from nma.params import Bounds
 
 Array = NDArray[np.float32]
-# The position of a name is its number in nma_c.h.
+# The index of a name in this tuple is the value of the instruction set's constant in nma_c.h.
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
-# Alignment of a BRDF in memory [bytes].
+# The alignment of a BRDF in memory [bytes].
 _ALIGNMENT = 16
 _MESSAGE = 500
 
@@ -45,15 +45,16 @@ class Runtime:
 
     Args:
         adapter: the name of a shipped adapter, or a weights file.
-        instruction_set: one of `INSTRUCTION_SETS`. A set that the CPU does not have is replaced by "portable". All sets
-            except "avx512_bf16" compute in float32.
-        compact: round the weights to bfloat16. This is faster, and `runtime/README.md` gives the loss of accuracy.
+        instruction_set: one of `INSTRUCTION_SETS`. If the CPU does not have the instruction set, "portable" replaces
+            it. All instruction sets except "avx512_bf16" compute in float32.
+        compact: round the weights to bfloat16. The rounding saves time, and `runtime/README.md` gives the loss of
+            accuracy.
 
     Attributes:
         parameters: the number of columns of `params`.
         names: for each column, the name of its parameter.
         low, high: the training range of each column.
-        material: the parameters of the material, if the adapter was trained on a single one; None otherwise.
+        material: the parameters of the material, if the adapter was fitted to a single material; None otherwise.
         size: the number of the network's outputs.
         instruction_set: the instruction set in use.
         anisotropic: whether the adapter depends on the azimuth of `wi`.
@@ -76,7 +77,7 @@ class Runtime:
         if not handle:
             raise WeightsError(message.value.decode())
         self._handle = ctypes.c_void_p(handle)
-        # The number of floats in a row that `prepare` returns.
+        # The number of floats in each row of the array that `prepare` returns.
         self._brdf = self._c.nma_brdf_size() // np.dtype(np.float32).itemsize
         self.parameters = self._c.nma_parameter_count(self._handle)
         self.names = [self._name(k) for k in range(self.parameters)]
@@ -91,16 +92,16 @@ class Runtime:
             self._c.nma_free(handle)
 
     def outputs(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
-        """The raw outputs (n, size) of the network. Arguments and errors are those of `prepare`."""
+        """The raw outputs (n, size) of the network. This method has the arguments and the errors of `prepare`."""
         return self._many("nma_outputs", self._checked(params, clamp), wi, self.size)
 
     def prepare(self, params: ArrayLike, wi: ArrayLike, *, clamp: bool = False) -> Array:
         """Runs the network and returns n BRDFs for `eval_pdf` and `sample`, as an array of opaque rows.
 
         Args:
-            params: materials (n, parameters), within the training range.
-            wi: view directions (n, 3), unit vectors above the horizon. For isotropic adapters their cosines (n,), in
-                0..1, are enough.
+            params: the parameters (n, parameters) of n materials, within the training range.
+            wi: view directions (n, 3), unit vectors above the horizon. For isotropic adapters, the cosines (n,) of
+                these directions with the normal, in 0..1, are enough.
             clamp: clamp parameters to the training range instead of raising an error.
 
         Raises:
@@ -110,23 +111,23 @@ class Runtime:
         return self._many("nma_prepare", self._checked(params, clamp), wi, self._brdf)
 
     def eval(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """f cos(theta_o) [1/sr], (n, 3). It is 0 below the horizon."""
+        """The values f cos(theta_o) [1/sr], (n, 3). A value is 0 if `wo` is below the horizon."""
         return self.eval_pdf(brdfs, wi, wo)[0]
 
     def pdf(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> Array:
-        """The density [1/sr] with which `sample` draws `wo`, (n,). It is 0 below the horizon."""
+        """The densities [1/sr] with which `sample` draws `wo`, (n,). A density is 0 if `wo` is below the horizon."""
         return self.eval_pdf(brdfs, wi, wo)[1]
 
     def eval_pdf(self, brdfs: Array, wi: ArrayLike, wo: ArrayLike) -> tuple[Array, Array]:
-        """The results of `eval` (n, 3) and `pdf` (n,), in the time of one of them."""
+        """The results of `eval` (n, 3) and `pdf` (n,). The call takes no longer than `eval` alone or `pdf` alone."""
         found = self._each("nma_eval_pdf", brdfs, wi, 4, wo)
         return found[:, :3], found[:, 3]
 
     def sample(self, brdfs: Array, wi: ArrayLike, u: ArrayLike) -> tuple[Array, Array, Array]:
         """Draws directions `wo` from uniform numbers `u` (n, 3) in [0, 1).
 
-        Returns (wo (n, 3), value (n, 3), pdf (n,)), with value and pdf as `eval_pdf` gives them. A pdf of 0 marks an
-        invalid sample.
+        Returns (wo (n, 3), value (n, 3), pdf (n,)). The values and the densities equal those of `eval_pdf`. A density
+        of 0 marks an invalid sample.
         """
         found = self._each("nma_sample", brdfs, wi, 7, u)
         return found[:, :3], found[:, 3:6], found[:, 6]
@@ -134,7 +135,7 @@ class Runtime:
     def albedo(self, brdfs: Array, wi: ArrayLike) -> Array:
         """Directional albedos (n, 3) at `wi`, at most 1.
 
-        Each is the mean over 128 fixed samples, so equal arguments give equal albedos.
+        Each albedo is a mean over 128 fixed samples, so equal arguments give equal albedos.
         """
         return self._each("nma_albedo", brdfs, wi, 3)
 
@@ -142,7 +143,7 @@ class Runtime:
         return self._c.nma_parameter_name(self._handle, column).decode()
 
     def _ranges(self) -> tuple[Array, Array]:
-        """The lower and the upper end of each column's training range, each (parameters,)."""
+        """Two arrays (parameters,): the lower ends and the upper ends of the columns' training ranges."""
         ends = np.empty((self.parameters, 2), np.float32)
         for column, pair in enumerate(ends):
             self._c.nma_parameter_range(self._handle, column, _pointer(pair))
@@ -153,7 +154,8 @@ class Runtime:
         return numbers if self._c.nma_single_material(self._handle, _pointer(numbers)) else None
 
     def _checked(self, params: ArrayLike, clamp: bool) -> Array:
-        """`params` as float32 rows. Raises `ParamError` if they are outside the range, or not the single material's."""
+        """`params` as float32 rows. Raises `ParamError` if a parameter is outside the training range, or differs from
+        that of the single material that the adapter was fitted to."""
         rows = _rows("params", params, self.parameters)
         if self.material is not None:
             other = ~np.isclose(rows, self.material, rtol=SAME)
@@ -184,7 +186,7 @@ class Runtime:
         return found
 
     def _views(self, wi: ArrayLike) -> Array:
-        """`wi` as float32: directions (n, 3), or cosines (n,) if the adapter is isotropic."""
+        """`wi` as float32: directions (n, 3), or cosines (n,) with the normal if the adapter is isotropic."""
         shape = np.shape(wi)
         if len(shape) > 1:
             return _rows("wi", wi, 3)
@@ -205,7 +207,7 @@ class Runtime:
 
 
 def _rows(name: str, values: ArrayLike, *row: int) -> Array:
-    """`values` as a contiguous, aligned float32 array (n, *row). Raises `ParamError` for another shape."""
+    """`values` as a contiguous, aligned float32 array (n, *row). Raises `ParamError` if `values` has another shape."""
     array = np.ascontiguousarray(values, np.float32)
     if array.shape[1:] != row:
         wanted = "(n,)" if not row else f"(n, {row[0]})"
