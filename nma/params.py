@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma import ops
-from nma.data import load_conductors
+from nma.conductors import load_conductors
 from nma.errors import ParamError
 
 Law = Literal["uniform", "log10", "one_minus_square", "conductor"]

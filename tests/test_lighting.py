@@ -7,7 +7,7 @@ import nma.render
 from nma.cli.preview import View
 from nma.errors import ParamError
 from nma.materials import load as load_material
-from nma.render.clamp import clamped
+from nma.render.fireflies import clamped
 from nma.render.lighting import LIGHTINGS, SOFTBOXES, sky_directions, sky_radiance, studio_radiance
 from nma.render.load import load_dict
 from nma.render.progressive import pass_sizes, render_passes, sampler

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nma import materials
-from nma.data import load_conductors
+from nma.conductors import load_conductors
 from nma.errors import MaterialError, NmaError
 from nma.microfacet import fresnel_conductor
 from nma.params import LAYERED3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nma.data import load_conductors
+from nma.conductors import load_conductors
 from nma.errors import ParamError
 from nma.params import LAYERED3, LIBRARY, MEASURED, SPACES, Param, ParamSpace
 

@@ -1,4 +1,4 @@
-"""Writes nma/data/conductors.csv: the indices of refraction of real metals, in linear sRGB.
+"""Writes nma/conductors/conductors.csv: the indices of refraction of real metals, in linear sRGB.
 
     python tools/make_conductors.py [OUT.csv]
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from nma.files import write_text
 
-OUT = Path(__file__).parents[1] / "nma" / "data" / "conductors.csv"
+OUT = Path(__file__).parents[1] / "nma" / "conductors" / "conductors.csv"
 HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
 
 # A material with a lower k than this in any channel is a tinted dielectric. The next material above has .114.

@@ -28,8 +28,8 @@ from figures import common
 from nma import materials
 from nma.images.metrics import errors
 from nma.images.sheet import PAPER, Row, contact_sheet
-from nma.render.clamp import clamped
 from nma.render.demo import worn_silver
+from nma.render.fireflies import clamped
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
 from nma.render.progressive import render_passes, sampler
 

@@ -41,8 +41,8 @@ from nma.sources.coating import Coating
 from nma.sources.mitsuba_bsdf import from_dict
 from nma.sources.nbrdf import WEIGHTS, Nbrdf
 from nma.table.values import tabulate_values
-from nma.train.constant import CONSTANT, fit_constant
 from nma.train.fit import recipe_for
+from nma.train.principled import CONSTANT, fit_constant
 
 DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")

@@ -74,7 +74,7 @@ def principled(
     """
     if output is not None:
         files.try_file(output)
-    from nma.train.constant import CONSTANT, fit_constant
+    from nma.train.principled import CONSTANT, fit_constant
 
     tables, record = reading.tables_of(source, material, walks, seed)
     recipe = replace(CONSTANT, seed=seed)

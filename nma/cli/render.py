@@ -113,7 +113,7 @@ def _load_file(
 
 
 def _clamped(scene: Any, limit: float) -> Any:
-    from nma.render.clamp import clamped
+    from nma.render.fireflies import clamped
 
     return clamped(scene.integrator(), limit)
 

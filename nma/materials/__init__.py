@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.data import load_conductors
+from nma.conductors import load_conductors
 from nma.errors import MaterialError, ParamError, closest, either, one_line
 from nma.images.io import CHANNELS, linear
 from nma.materials.texture import Texture

@@ -1,4 +1,4 @@
-"""Measures time and noise of a rendering over independent seeds, and tests whether two renderings have equal means."""
+"""Statistics of renderings: time and noise over independent seeds, and a test whether two have equal means."""
 
 from __future__ import annotations
 

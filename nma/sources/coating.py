@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nma import ops
-from nma.data import load_conductors
+from nma.conductors import load_conductors
 from nma.errors import ParamError
 from nma.microfacet import fresnel_conductor_rgb, fresnel_dielectric, ggx_d, smith_g1
 from nma.ops import Color, Float, Vec3
@@ -28,7 +28,7 @@ class Coating:
 
     `alpha` and `alpha_metal` are the GGX widths of coat and metal, 1e-4 .. 1. `absorption` is the coat's optical depth
     at normal incidence, per channel, at least 0. Raises `ParamError` for other numbers, and for a metal that is not
-    among those of `nma.data`.
+    among those of `nma.conductors`.
     """
 
     conductor: str = "Au"

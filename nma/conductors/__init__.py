@@ -1,4 +1,4 @@
-"""The data that is shipped with the package: indices of refraction of conductors."""
+"""Real metals: their indices of refraction, from a table that is shipped with the package."""
 
 import csv
 from dataclasses import dataclass

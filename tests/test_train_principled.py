@@ -20,7 +20,7 @@ from nma.sources.nbrdf import WEIGHTS
 from nma.table import Tables, stream_keys, tabulate
 from nma.table.values import tabulate_values
 from nma.target import Principled, eval_principled
-from nma.train.constant import CONSTANT, Constant, fit_constant
+from nma.train.principled import CONSTANT, Constant, fit_constant
 
 RED = Principled(Color(0.7, 0.15, 0.05), 0.35, 0.1, 0.6, 0.2, 0.3, 0.5, 0.6, 0.8, flatness=0.2)
 # The recipe of `nma principled` with fewer steps and points, to save time.
@@ -175,7 +175,7 @@ def fitted(fit, monkeypatch) -> list[tuple]:
         given.append((tables, record))
         return fit
 
-    monkeypatch.setattr("nma.train.constant.fit_constant", find)
+    monkeypatch.setattr("nma.train.principled.fit_constant", find)
     return given
 
 
@@ -185,7 +185,7 @@ def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monke
 
     The table in this test belongs to no class, because the fit needs no parameters of the material.
     """
-    monkeypatch.setattr("nma.train.constant.CONSTANT", SHORT)
+    monkeypatch.setattr("nma.train.principled.CONSTANT", SHORT)
     red.save(tmp_path / "red.npz")
     code, out, err = nma("principled", tmp_path / "red.npz")
     assert code == 0, err
@@ -200,7 +200,7 @@ def test_a_fit_that_misses_the_albedo_comes_with_a_warning(
 ):
     red.save(tmp_path / "red.npz")
     found = fit
-    monkeypatch.setattr("nma.train.constant.fit_constant", lambda *_, **__: found)
+    monkeypatch.setattr("nma.train.principled.fit_constant", lambda *_, **__: found)
     assert "warning" not in nma("principled", tmp_path / "red.npz")[2]
     found = fit._replace(figures=fit.figures | {"albedo_error": 0.128}, brightness=brightness)
     code, out, err = nma("principled", tmp_path / "red.npz")
