@@ -19,7 +19,10 @@ def random_adapter(
     params=PRINCIPLED_PARAMS,
     space=LAYERED3,
 ):
-    """Returns an untrained adapter. Its random weights are large enough that its outputs vary over the class."""
+    """Returns an untrained adapter.
+
+    The random weights are large enough that the outputs of the network vary over the class.
+    """
     rng = np.random.default_rng(seed)
     sizes = [
         encoding.size(name, space, directional),

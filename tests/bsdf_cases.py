@@ -1,4 +1,4 @@
-"""Helpers for the tests of BSDFs: a texture with one special pixel, and the error of a faulty description."""
+"""Helpers for the tests of BSDFs: a texture with one special pixel, and the error for a faulty description."""
 
 import mitsuba as mi
 import numpy as np

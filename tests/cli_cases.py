@@ -17,7 +17,10 @@ def commands(app=cli.app, path=()):
 
 
 def parameters(function):
-    """Yields name, type and declaration of each parameter of a command. For `int | None` the type is `int`."""
+    """Yields name, type and declaration of each parameter of a command.
+
+    The type of a parameter that is annotated as `int | None` is `int`.
+    """
     for name, hint in get_type_hints(function, include_extras=True).items():
         if name == "return" or not hasattr(hint, "__metadata__"):
             continue

@@ -12,17 +12,20 @@ from material_cases import PLAIN
 from nma import cli, llvm
 
 # Tests keep compiled code in a cache of their own, apart from the user's. All workers, programs and runs of the tests
-# share this cache. The name of each folder in the cache is the digest of its sources.
+# share the cache of compiled code. Each folder in the cache is named by the digest of the sources that were compiled.
 CACHE = Path(__file__).parents[1] / "build/tests"
 os.environ["XDG_CACHE_HOME"] = str(CACHE)
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "jax")
-# XLA's older emitters compile the training steps of the tests in half the time.
+# XLA's older emitters compile the training steps of the tests twice as fast as the newer ("fusion") emitters.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 
 @pytest.fixture
 def old_library(tmp_path: Path) -> str:
-    """The path of a libLLVM older than 16, which cannot report its version. If the system has none, we imitate one."""
+    """The path of a libLLVM older than 16, which cannot report its version.
+
+    If the system has no old libLLVM, the fixture compiles an imitation.
+    """
     for path in llvm.candidates():
         if llvm._version_of_name(path) < 16:
             return path
@@ -49,7 +52,7 @@ def compiler() -> str:
 def measurements() -> Path:
     """The folder of measured materials: NMA_TEST_DATA, or shared/data beside the checkout.
 
-    The repository holds no measurements. Tests that need measurements are skipped if this folder is missing.
+    The repository holds no measurements. Tests that need measurements are skipped if the folder is missing.
     """
     named = os.environ.get("NMA_TEST_DATA")
     folder = Path(named or Path(__file__).parents[2] / "shared/data")
@@ -97,7 +100,7 @@ def nma(monkeypatch, capsys):
 
 @pytest.fixture
 def material_file(tmp_path):
-    """A function that replaces text in PLAIN, writes the result as a material file, and returns its path."""
+    """A function that replaces text in the material file PLAIN, writes the result to a file, and returns its path."""
 
     def write(old: str = "", new: str = "") -> Path:
         assert old in PLAIN

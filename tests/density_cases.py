@@ -14,7 +14,9 @@ GRID_POINTS = BINS[0] * BINS[1] * PARTS**2
 def p_values(sample: Callable, density: Callable) -> tuple[float, float]:
     """Returns two p-values: of the samples against their density, and of the samples against a wrong density.
 
-    The wrong density must be rejected. Its error rises from -10 % in the first bin to +10 % in the last one.
+    The error of the wrong density rises from -10 % in the first bin to +10 % in the last bin, so that a test must
+    reject the wrong density.
+
     `sample(n)` returns directions (n, 3) and densities (n,). A density of 0 marks a direction below the horizon; all
     such directions share one extra bin. `density(wo)` returns the densities of directions (n, 3).
     """
@@ -31,7 +33,7 @@ def p_values(sample: Callable, density: Callable) -> tuple[float, float]:
 
 
 def chi_square(found, wanted):
-    """Returns the p-value of a chi-square test. Bins that expect fewer than ten samples are merged."""
+    """Returns the p-value of a chi-square test. All bins with fewer than ten expected samples are merged."""
     few = wanted < 10
     found = np.append(found[~few], found[few].sum())
     wanted = np.append(wanted[~few], max(wanted[few].sum(), 1e-3))
@@ -41,7 +43,7 @@ def chi_square(found, wanted):
 
 
 def _grid():
-    """Returns the centres of all cells as directions (n, 3), ordered by z first and by azimuth second."""
+    """Returns the centres of the cells of all bins as directions (n, 3), ordered by z first and by azimuth second."""
     z, phi = ((np.arange(n * PARTS) + 0.5) / (n * PARTS) for n in BINS)
     z, phi = (x.ravel() for x in np.meshgrid(z, 2 * np.pi * phi, indexing="ij"))
     r = np.sqrt(1 - z * z)

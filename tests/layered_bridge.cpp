@@ -14,7 +14,8 @@ constexpr Vec NOTHING{0.0f, 0.0f, 0.0f};
 Vec vec(const float* v) { return {v[0], v[1], v[2]}; }
 void put(const Vec& v, float* to) { std::copy_n(&v.x, 3, to); }
 
-// The sums of weights, and of their squares, over the bins of a table. nma/table has the same layout: [row, o, p, rgb].
+// For each bin of a table, the sum of the weights and the sum of the squared weights. As in nma/table, the indices are
+// [row of theta_i, bin of theta_o, bin of phi, colour channel].
 struct Bins {
     int o, p;
     double *sums, *squares;
@@ -31,13 +32,14 @@ struct Bins {
     }
 };
 
-// A random view direction of the row, at azimuth 0.
+// Returns a random view direction at azimuth 0, whose cosine lies in the given row of the table.
 Vec view(int row, int rows, layered::Random& random) {
     const float z = (static_cast<float>(row) + random.uniform()) / static_cast<float>(rows);
     return {nma::safe_sqrt(1.0f - z * z), 0.0f, z};
 }
 
-// A direction that follows the density. Its throughput is an estimate of the value, divided by the density.
+// Samples a direction from the density, and returns it as a walk. The throughput of this walk is an estimate of the
+// value, divided by the density.
 layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Random& random) {
     const layered::Density density(stack, wi);
     const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
@@ -50,20 +52,21 @@ layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Rand
 
 extern "C" {
 
-// Densities for one material, seen from one direction. `wo` has a row for each.
+// Writes the densities of n directions, the rows of `wo`, for one material and one view direction.
 void layered_pdf(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
     const auto stack = layered::Stack::of(parameters);
     const layered::Density density(stack, vec(wi));
     for (int i = 0; i < n; ++i) pdf[i] = layered::pdf(stack, density, vec(wi), vec(wo + 3 * i));
 }
 
-// Densities for a material, a view and a `wo` in each row.
+// Writes n densities. Each row has its own material, view direction and `wo`.
 void layered_pdf_each(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
     constexpr int COLUMNS = nma::layered3::COLUMNS;
     for (int i = 0; i < n; ++i) layered_pdf(1, parameters + COLUMNS * i, wi + 3 * i, wo + 3 * i, pdf + i);
 }
 
-// `u` has rows of three uniform numbers. `out` gets rows of seven: wo, its density, and an estimate of the value.
+// `u` has rows of three uniform random numbers. Each row of `out` gets seven numbers: the three of wo, the density of
+// wo, and the three channels of an estimate of the value.
 void layered_sample(int n, const float* parameters, const float* wi, const float* u, float* out) {
     const auto stack = layered::Stack::of(parameters);
     const layered::Density density(stack, vec(wi));
@@ -76,14 +79,15 @@ void layered_sample(int n, const float* parameters, const float* wi, const float
     }
 }
 
-// Writes the throughputs of n walks, three floats each.
+// Writes the throughputs of n walks, with three floats per throughput.
 void layered_walks(int n, const float* parameters, const float* wi, float* out) {
     const auto stack = layered::Stack::of(parameters);
     layered::Random random(3, 4);
     for (int i = 0; i < n; ++i) put(layered::walk(stack, vec(wi), random).throughput, out + 3 * i);
 }
 
-// Fills a table from walks, or else from estimates: `per_row` of them for each row of views.
+// Fills a table from random walks (if `walks`) or from estimates (otherwise). Each row of the table gets the weights of
+// `per_row` walks or estimates.
 void layered_table(bool walks, int rows, int o, int p, int per_row, int seed, const float* parameters, double* sums,
                    double* squares) {
     const auto stack = layered::Stack::of(parameters);

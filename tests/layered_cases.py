@@ -15,7 +15,8 @@ GRID = Grid(theta_i=5, theta_o=10, phi_o=10)
 WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
 COPPER = {"eta_conductor": (0.24, 0.96, 1.18), "k_conductor": (3.9, 2.6, 2.4)}
 
-# Narrow and wide lobes of coat and conductor, thin and thick media, and coats of high, low and matched index.
+# The hard cases have narrow or wide lobes of coat and conductor, thin or thick media, and coats with a high, a low or
+# a matched index of refraction.
 CASES = {
     "white_coated": {"alpha_top": 0.2, "alpha_bottom": 0.4, "eta_top": 1.5, "sigma_t": 0.0, **WHITE},
     "white_with_medium": {
@@ -39,7 +40,7 @@ CASES = {
     },
     "index_matched": {"alpha_top": 1e-4, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 1.0, "albedo": 0.7},
 }
-# For tests that walk long: three cases in every run, the others with the slow tests.
+# Tests with many walks run three cases always, and all other cases only with the slow tests.
 SLOW_CASES = [
     name if name in ("narrow_wide", "thick", "white_coated") else pytest.param(name, marks=pytest.mark.slow)
     for name in CASES
@@ -67,11 +68,12 @@ def table_of(sums, squares, per_row):
 def z_scores(found, error, walks, factor=1.0, known=np.inf):
     """Returns the z-scores of `factor` times `found` minus the table `walks`.
 
-    Each row has a score, and so has each bin with over 100 walks and with a relative error below `known`.
+    There is a score for each row, and for each bin with over 100 walks and with a relative error below `known`.
     """
     enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
     enough &= error < known * found
     difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2
-    # A walk ends in one bin only, so bins are negatively correlated: this sum is an upper bound of the variance.
+    # A walk ends in one bin only, so bins are negatively correlated. The sum of the variances of the bins is therefore
+    # an upper bound of the variance of the row.
     rows = difference.sum(axis=(1, 2)) / np.sqrt(variance.sum(axis=(1, 2)))
     return np.concatenate([difference[enough] / np.sqrt(variance[enough]), rows.ravel()])

@@ -1,5 +1,5 @@
-// The functions that tests of the runtime call in addition to the C interface: the target on arrays, in float and in
-// double, and the numbers in a BRDF.
+// The functions that tests of the runtime call in addition to the C interface. They evaluate the target on arrays, in
+// float and in double, and copy the parameters of a BRDF's instances to an array.
 #include "nma.h"
 #include "nma_c.h"
 
@@ -7,8 +7,8 @@ namespace {
 
 constexpr int FIELDS = nma::Blend<float>::FIELDS;
 
-// A blend from its numbers: the fields of the first instance in the order of `Principled`, those of the second, and so
-// on, and then all weights.
+// Makes a blend from an array: the fields of the first instance in the order of `Principled`, the fields of the second
+// instance, and so on, and then the weights of all instances.
 template <class T>
 nma::Blend<T> blend_of(const T* numbers, int count) {
     nma::Blend<T> made(count);
@@ -55,7 +55,7 @@ void sample_double(int n, int count, const double* blends, const double* wi, con
     }
 }
 
-// Writes the numbers of BRDFs that the C interface made: the fields of all instances, then their weights.
+// Writes the blends of n BRDFs that the C interface made: the fields of all instances, and then their weights.
 void brdf_numbers(int n, int count, const nma_brdf* brdfs, float* out) {
     for (int i = 0; i < n; ++i, out += (FIELDS + 1) * count) {
         const nma::Blend<float>& blend = reinterpret_cast<const nma::Brdf*>(brdfs + i)->blend();

@@ -21,7 +21,7 @@ MATERIAL = {
     "sigma_t": 0.5,
 }
 CHECKS = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.9, 0.2, 0.1]}, "color1": 0.3}
-# Every program begins with this text, which reads the arguments and sets the variant.
+# Every test program begins with the following text, which reads the arguments and sets Mitsuba's variant.
 PRELUDE = """
 import json, sys
 import mitsuba as mi
@@ -49,7 +49,7 @@ def interaction(cosine, azimuth=0.0):
 
 
 def plugins() -> Path:
-    """Compiles the plugins and returns their folder. `conftest.py` chooses the cache that holds this folder."""
+    """Compiles the plugins and returns their folder, which lies in the cache that `conftest.py` chooses."""
     if shutil.which("c++") is None:
         pytest.skip("there is no C++ compiler here")
     return build.build_mitsuba()

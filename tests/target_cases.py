@@ -5,8 +5,8 @@ import numpy as np
 from nma.ops import Color, Vec3
 from nma.target import Blend, Principled
 
-# Arguments of `jax.jit` for tests that spend most of their time on compiling. These options turn off slow steps of
-# XLA, above all the fusion of the target into large kernels.
+# Arguments of `jax.jit` for tests that spend most of their time on compiling. The options turn off slow passes of XLA's
+# compiler, above all the fusion of the target's operations into large kernels.
 FAST_COMPILE = {
     "compiler_options": {
         "xla_disable_hlo_passes": "fusion,cpu-instruction-fusion",
@@ -19,9 +19,10 @@ FAST_COMPILE = {
 def random_principled(
     rng: np.random.Generator, n: int, dialect: bool = True, fades: bool = False
 ) -> Principled:
-    """Returns n random parameter sets. Widths spread over decades, and many parameters are exactly 0 or 1.
+    """Returns n random parameter sets. The roughness spreads over decades, and many parameters are exactly 0 or 1.
 
-    `dialect` adds parameters that the paper leaves out. `fades` adds parameters that Mitsuba's BSDF does not have.
+    With `dialect`, the parameters that the paper leaves out are not 0. With `fades`, the parameters that Mitsuba's
+    BSDF does not have are random too.
     """
 
     def often_pure():
@@ -66,7 +67,7 @@ def random_directions(rng: np.random.Generator, n: int) -> Vec3:
 
 
 def mapped(tree, f):
-    """Returns the same nested tuples with `f` applied to every array. Python numbers stay as they are."""
+    """Applies `f` to every array in nested tuples, and returns the new tuples. Python numbers remain unchanged."""
     if isinstance(tree, tuple):
         parts = [mapped(t, f) for t in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)

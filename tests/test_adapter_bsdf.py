@@ -1,4 +1,4 @@
-"""The Mitsuba BSDF `nma` has the values of its adapter, its methods agree, and it checks inputs and edits."""
+"""The Mitsuba BSDF `nma`: its values are those of the adapter, its methods agree, and it checks inputs and edits."""
 
 import json
 import math
@@ -41,7 +41,10 @@ def _variant():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """The weights of a small adapter, which compiles quickly. Its values are arbitrary and vary with every input."""
+    """The weights file of a small adapter, which compiles quickly.
+
+    The values of the adapter are arbitrary and vary with every input.
+    """
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
     random_adapter(hidden="2x8").save(path)
     return path
@@ -49,7 +52,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stretched_weights(tmp_path_factory):
-    """The weights of a small adapter with bounded energy and with lobes stretched in the plane of incidence."""
+    """The weights file of a small adapter with bounded energy and with lobes stretched in the plane of incidence."""
     path = tmp_path_factory.mktemp("weights") / "stretched.safetensors"
     replace(random_adapter(hidden="2x8", params=target.STRETCHED_PARAMS), bounded=True).save(path)
     return path
@@ -65,7 +68,10 @@ def description(weights, **changes):
 
 
 def textured(weights, **changes):
-    """Returns the description of the same material, with three parameters as textures of one colour."""
+    """Returns a description of the same material as `description` does, but gives three parameters as textures.
+
+    Each texture has the same value everywhere.
+    """
     images = {name: bitmap_texture(np.full((4, 8, np.size(v)), v)) for name, v in TEXTURED.items()}
     return description(weights, **images, **changes)
 
@@ -91,8 +97,8 @@ def close(a, b, rtol=1e-4, atol=1e-6):
 def test_values_are_those_of_the_adapter(weights, make):
     """The BSDF has the values and densities that NumPy computes from the adapter.
 
-    The mean error is below 1e-5 for textured materials. It is below 2e-4 for untextured materials, which interpolate
-    curves.
+    The mean relative error is below 1e-5 for textured materials. The limit for untextured materials is 2e-4, because
+    an untextured material interpolates the parameters of its target from curves.
     """
     bsdf, (si, rng) = mi.load_dict(make(weights)), interactions(2000)
     wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
@@ -105,7 +111,7 @@ def test_values_are_those_of_the_adapter(weights, make):
     expected, density = brdf.eval_pdf(Vec3(*wi), Vec3(*np.array(wo, np.float64)))
     for found, wanted in ((value, np.stack(expected)), (pdf, density)):
         error = np.abs(np.array(found) - wanted) / wanted
-        # Single precision makes larger errors near narrow peaks.
+        # Near narrow peaks, single precision causes larger errors than on average.
         assert error.mean() < (1e-5 if make is textured else 2e-4)
         assert error.max() < 1e-2
 
@@ -200,7 +206,7 @@ def test_samples_follow_the_pdf(material):
                 sample_dim=3,
                 sample_count=1 << 17,
                 res=51,
-                ires=32,  # with ires=8, the test's own integral of a narrow lobe is .5 % off
+                ires=32,  # points per bin: with 8, the test's own integral of a narrow lobe is .5 % off
             )
             assert test.run(0.01, 3), (adapter, wi, test.messages)
 
@@ -237,7 +243,10 @@ def scene(bsdf, name="material", **integrator):
 
 
 def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
-    """Curves, the network and evaluated loops render equal pictures from equal random numbers, up to rounding."""
+    """Pictures from curves and from the network, with symbolic and with evaluated loops, are equal up to rounding.
+
+    All pictures use the same random numbers.
+    """
     curves = np.array(mi.render(scene(description(weights)), spp=16, seed=1))
     loaded = scene(textured(weights))
     network = np.array(mi.render(loaded, spp=16, seed=1))
@@ -245,7 +254,7 @@ def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
     with dr.scoped_set_flag(flags[0], False), dr.scoped_set_flag(flags[1], False):
         wavefront = np.array(mi.render(loaded, spp=16, seed=1))
     assert curves.mean() > 0.1
-    # Rounding may change the direction of a sample completely. Up to 1 % of the pixels may contain such samples.
+    # Rounding may change the direction of a sample completely, so that up to 1 % of the pixels may differ.
     for other in (curves, wavefront):
         off = np.abs(network - other) > 0.01 * network
         assert off.mean() < 0.01
@@ -253,7 +262,7 @@ def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
 
 
 def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
-    """A path tracer evaluates and samples a BSDF at each shading point, and runs the network once for both.
+    """A path tracer evaluates and samples a BSDF at each shading point, but runs its network only once there.
 
     A failure means that the network runs more often than needed, and pictures take longer.
     """
@@ -270,7 +279,7 @@ def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
         monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
     dr.eval(mi.render(scene(textured(weights)), spp=1))
     assert calls.count("forward_lanes") == calls.count("eval_pdf") == calls.count("sample") > 0
-    # Outside of a rendering, each call runs the network.
+    # Outside of a rendering, each call of `eval_pdf` or `sample` runs the network.
     bsdf, (si, rng) = mi.load_dict(textured(weights)), interactions(10)
     calls.clear()
     bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(0.0, 0.6, 0.8))

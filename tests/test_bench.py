@@ -14,7 +14,7 @@ from bench import density, frames, samples, scenes, settings
 from nma.render.scene import CAMERAS
 
 ROOT = Path(__file__).parent.parent
-# These benches also write a picture of their results.
+# The names of the benches that write a picture of their results in addition to a JSON file.
 PICTURED = ["density", "networks", "render", "samples", "scalar", "settings", "teaser"]
 SIMULATION = {"seconds": 2.0, "variance": 0.4, "error": 0.4, "doubt": 0.03}
 ADAPTER = {"seconds": 1.0, "variance": 0.2, "error": 0.5, "doubt": 0.04}
@@ -81,7 +81,8 @@ def test_the_error_is_variance_and_squared_bias_without_the_noise_of_the_converg
     for bias in (0.0, 0.3):
         pictures = noisy(rng, 1.0 + bias, 0.5, 8)
         found = frames.figures(frames.Frames(pictures, np.ones(8), np.ones(8)), reference)
-        # The converged picture has a variance of 0.09. If it were not subtracted, the error would be 0.09 larger.
+        # The converged picture has a variance of 0.09. The error would be 0.09 larger if that variance were not
+        # subtracted.
         assert found["variance"] == pytest.approx(0.25, rel=0.03)
         assert found["error"] == pytest.approx(0.25 + bias**2, rel=0.05)
         assert 0.0 < found["doubt"] < 0.05

@@ -1,4 +1,4 @@
-"""The bounds of a parameter are the same wherever it is given: one check, one tolerance, one error message."""
+"""All ways to give a parameter (file, command line, scene, edit) have the same bounds, tolerance and error message."""
 
 import re
 
@@ -49,7 +49,10 @@ def text(value):
 
 
 class Entries:
-    """All ways to give a parameter. Each method takes its name and value, and raises if the value is refused."""
+    """All ways to give a parameter, as methods.
+
+    Each method takes the parameter's name and value, and raises an error if the value is refused.
+    """
 
     def __init__(self, folder, adapter, material_file, command):
         self.folder, self.adapter, self.material_file, self.command = folder, adapter, material_file, command
@@ -69,7 +72,7 @@ class Entries:
         material = self.material_file()
         given = ",".join(map(str, np.ravel(value)))
         status, _, said = self.command("render", material, "--set", f"{name}={given}", "--mesh", "none.ply")
-        # If the value is allowed, the command fails later, because the mesh does not exist.
+        # If the value is allowed, the command fails at a later step, because the mesh file none.ply does not exist.
         if status and "none.ply" not in said:
             raise NmaError(" ".join(said.split()))
 
@@ -91,7 +94,7 @@ class Entries:
 
 
 class TrainedEntries(Entries):
-    """The ways to give a parameter to an adapter. The training range of the adapter bounds the value."""
+    """All ways to give a parameter to an adapter. The value must lie in the training range of the adapter."""
 
     def vector(self, name, value):
         nma.Adapter.load(self.adapter).check(LAYERED3.vector(PLAIN | {name: value}))
@@ -144,7 +147,10 @@ def give(tmp_path, adapter, material_file, nma):
 
 
 def beyond(kind, steps):
-    """Yields (name, value) with values that lie `steps` tolerances beyond either bound, in one channel of a triple."""
+    """Yields (name, value) with values that lie `steps` tolerances beyond the lower or the upper bound.
+
+    Of a colour, only one channel lies beyond its bound.
+    """
     for name in NAMES:
         low, high = LAYERED3[name].bounds(kind)
         slack = steps * ROUNDING * min(high - low, 1.0)

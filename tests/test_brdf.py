@@ -1,4 +1,7 @@
-"""Adapters of every kind prepare a BRDF with its frame. The methods of the BRDF agree for every azimuth of the view."""
+"""Adapters of every kind prepare a BRDF whose methods agree for every azimuth of the view.
+
+Where lobes are stretched in the plane of incidence, the BRDF includes the frame of this plane.
+"""
 
 import math
 from dataclasses import replace
@@ -31,7 +34,7 @@ KINDS = {
 ISOTROPIC = tuple(kind for kind in KINDS if kind != "anisotropic")
 IN_PLANE = ("stretched", "bounded", "single")
 AZIMUTHS = (0.0, 2.0, 4.5)
-# A blend of a bright stretched metal and a paint with sheen. It reflects more light than it receives.
+# A blend of a bright stretched metal and a paint with sheen. The blend reflects more light than it receives.
 BLEND = Blend(
     (
         Principled(Color(1.0, 0.9, 0.8), 0.5, 1.0, 0.5, 0.1, 0.1, 0.1, 0.3, 0.2, -4.0, 0.1, -0.1, 0.5),
@@ -122,13 +125,16 @@ def test_an_isotropic_material_looks_the_same_when_both_directions_turn(kind):
 
 
 def off(found, expected):
-    """Returns the mean absolute difference, relative to the mean of `expected`."""
+    """Returns the mean absolute difference between `found` and `expected`, relative to the mean of `expected`."""
     return np.abs(stacked(found) - stacked(expected)).mean() / stacked(expected).mean()
 
 
 @pytest.mark.parametrize("kind", IN_PLANE)
 def test_evaluating_a_blend_without_its_frame_is_wrong(kind):
-    """A blend evaluated without its frame is more than 40 % off, so that other tests here would notice the mistake."""
+    """A blend evaluated without its frame is more than 40 % off.
+
+    So the other tests in this file would detect a BRDF that ignores its frame.
+    """
     wi, wo = pairs()
     brdf = prepared(kind, wi)
     assert off(target.eval(brdf.blend, wi, wo), brdf.eval(wi, wo)) > 0.4
@@ -152,15 +158,15 @@ def test_bounded_adapters_are_dimmed():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_targets_that_stretch_in_the_plane_of_incidence_have_a_frame(kind):
-    """Other BRDFs have no frame, so that Dr.Jit records no operation for one."""
+    """BRDFs of all other targets have no frame, so that Dr.Jit does not record operations to compute a frame."""
     assert isinstance(prepared(kind, pairs()[0]).plane, Plane if kind in IN_PLANE else type(None))
 
 
 @pytest.mark.parametrize("kind", ISOTROPIC)
 def test_curves_and_numbers_describe_the_same_brdf(kind):
-    """BRDFs from numbers and from curves equal the prepared one within 1e-5 and 1e-3.
+    """`from_numbers` and `Curves.at` give the same BRDF as `prepare`, within 1e-5 and 1e-3.
 
-    The first difference is rounding in the network, the second also interpolation between the nodes of the curves.
+    The difference of `from_numbers` is due to rounding in the network. Curves also interpolate between their nodes.
     """
     wi, wo = pairs()
     own, expected = adapter(kind), prepared(kind, wi).eval(wi, wo)
@@ -179,7 +185,7 @@ def test_an_anisotropic_adapter_has_no_curves():
 
 
 def test_a_cosine_in_place_of_the_direction_is_refused():
-    """`prepare` once took cosines. The message says how to make a direction of one."""
+    """`prepare` took a cosine in older versions. The error message names a function that makes a direction of it."""
     adapter = Adapter.load("layered3-3x32")
     columns = list(LAYERED3.sample(np.random.default_rng(0), 2).T)
     for cosine in (0.5, np.array([0.5, 0.6]), mi.Float(0.5)):

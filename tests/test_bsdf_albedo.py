@@ -1,4 +1,7 @@
-"""Our BSDFs report their directional albedo at wi to denoisers and `aov`. This albedo has no noise and is at most 1."""
+"""Our BSDFs report their directional albedo at wi to denoisers and to the integrator `aov`.
+
+The reported albedo has no noise and is at most 1.
+"""
 
 import mitsuba as mi
 import numpy as np

@@ -17,7 +17,7 @@ APP = typer.main.get_command(cli.app)
 COMMANDS = tuple(APP.commands)
 
 
-# Packages that take long to import, and that only the work of a command needs.
+# Packages that take long to import. `nma --help` and `nma --version` must not import them.
 HEAVY = ("numpy", "mitsuba", "drjit", "jax", "zarr", "PIL", "matplotlib")
 
 
@@ -25,7 +25,7 @@ def test_every_command_has_a_file_of_its_name():
     for words, function in commands():
         file = function.__module__.removeprefix("nma.cli.")
         assert file in cli.COMMANDS
-        assert file in words[0].split("-")  # train-library is in library.py
+        assert file in words[0].split("-")  # for example, `train-library` is in library.py
 
 
 def test_help_and_version_import_no_slow_package():

@@ -16,7 +16,7 @@ from nma.train.recipe import SINGLE
 
 
 def printed(monkeypatch, width, *table):
-    """Prints a table for a terminal of this width, and returns its lines."""
+    """Prints a table for a terminal of the given width, and returns the printed lines."""
     monkeypatch.setattr(console, "out", Console(width=width, file=io.StringIO()))
     console.out.print(console.table(*table))
     return [line.rstrip() for line in console.out.file.getvalue().splitlines()]
@@ -39,7 +39,7 @@ def test_numbers_are_never_broken(monkeypatch, width):
 
 
 def test_the_figures_of_an_evaluation_fit_80_columns(monkeypatch):
-    """A row of typical figures fits into one line of 80 columns, without lost digits."""
+    """A row of typical figures of merit fits into one line of 80 columns, without lost digits."""
     row = ("mean", 0.002731, 0.004236, 0.09136, 0.07076, 0.001586, 64.42, 0.00521, 0.001035)
     lines = printed(monkeypatch, 80, ("material", *FIGURES), [row])
     assert len(row) == 1 + len(FIGURES)

@@ -1,4 +1,4 @@
-"""`nma evaluate` prints its figures as a table, or as JSON for other programs."""
+"""`nma evaluate` prints figures of merit as a table, or as JSON for other programs."""
 
 import json
 

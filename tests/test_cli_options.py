@@ -1,4 +1,4 @@
-"""The options of all commands: declared bounds and choices, and refusals of other values."""
+"""The options of all commands declare bounds or choices, and refuse all other values."""
 
 from typing import get_args, get_type_hints
 
@@ -80,7 +80,10 @@ def test_an_unknown_choice_is_wrong_usage(nma, tmp_path, monkeypatch, words):
     ids=lambda given: given if isinstance(given, str) else given[0],
 )
 def test_an_output_must_have_the_ending_of_its_format(nma, tmp_path, monkeypatch, words, ending):
-    """A command refuses an output with another ending before its work, because no command would read that file."""
+    """A command refuses an output file whose name has a wrong ending, because no command would read this file.
+
+    The refusal comes before any other work.
+    """
     monkeypatch.chdir(tmp_path)
     for name in ("x", "x.bin"):
         code, out, err = nma(*words, "-o", name)

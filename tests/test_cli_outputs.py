@@ -1,4 +1,7 @@
-"""Commands check their outputs before they begin. If an output cannot be written, a command fails with one line."""
+"""Commands check their outputs before they begin.
+
+If an output cannot be written, the command fails with a message of one line.
+"""
 
 import errno
 import sys
@@ -17,7 +20,7 @@ FUNCTIONS = dict(commands())
 
 
 def arguments(words, output):
-    """Returns the words of the command with this output. The files that the command would read do not exist."""
+    """Returns the words of a command that writes `output`. The input files of the command do not exist."""
     given = []
     for name, _, info in parameters(FUNCTIONS[words]):
         if isinstance(info, ArgumentInfo):
@@ -38,7 +41,7 @@ def _renders_nothing(monkeypatch):
 
 @pytest.fixture
 def bad(tmp_path, monkeypatch):
-    """The current folder, with a file in it, below which no output can be written."""
+    """The current folder, which contains a file named `file`. No output can be written to a path below that file."""
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("mine")
     return tmp_path

@@ -1,4 +1,4 @@
-"""The option `--set` of commands changes the parameters of a material."""
+"""The command-line option `--set` changes the parameters of a material."""
 
 import numpy as np
 import pytest

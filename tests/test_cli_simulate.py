@@ -30,7 +30,7 @@ def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, mo
     code, out, err = nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")
     assert (code, out) == (1, "")
     assert "nma: " in err.splitlines()[-1] and "No space left" in err.splitlines()[-1]
-    # The simulated material is kept for the next run.
+    # The folder x.npz.parts keeps the simulated material, so that the next run of the command need not simulate it.
     assert [path.name for path in tmp_path.iterdir()] == ["x.npz.parts"]
     monkeypatch.undo()
     monkeypatch.setattr(table, "tabulate", None)
@@ -52,9 +52,10 @@ def test_a_damaged_part_is_simulated_again(nma, tmp_path):
 
 
 def test_a_run_survives_if_another_run_removes_its_parts(nma, tmp_path, monkeypatch):
-    """Two runs write one output. The first ends and removes the folder of parts, just before the second renames a part.
+    """Two runs write the same output, and the first run removes the folder of parts before the second run needs it.
 
-    A failure means that the second run stops with an error.
+    The folder vanishes just before the second run renames a part. A failure means that the second run stops with an
+    error.
     """
     replace, taken = Path.replace, []
 
