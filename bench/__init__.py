@@ -1,1 +1,1 @@
-"""Benches: they measure how long things take, and how good a frame is for its time."""
+"""Benches: scripts that measure running times, and the error of a rendered frame relative to its rendering time."""

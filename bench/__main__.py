@@ -15,12 +15,12 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-# Benches that only print and write no files, with their options for a quick run.
+# Benches that write no files, each with its options for a quick run.
 PRINTING = {"training": ["--steps", "60"], "walks": ["--walks", "81920", "--repeat", "1"]}
 
 
 def benches() -> dict[str, Path]:
-    """Name and script of every bench. A bench is a file in this folder that can be run."""
+    """Returns the name and the script of every bench. A bench is a file in this folder that runs as a script."""
     scripts = sorted(HERE.glob("*.py"))
     return {s.stem: s for s in scripts if s != Path(__file__) and '__name__ == "__main__"' in s.read_text()}
 
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def words(name: str, quick: bool, output: Path | None) -> list[str]:
-    """The command-line options for one bench."""
+    """Returns the command-line options for one bench."""
     if name in PRINTING:
         return PRINTING[name] if quick else []
     if name == "runtime":

@@ -1,13 +1,14 @@
-"""Fig. 9 of the paper: a frame's time over the medium's extinction, which slows the simulation but not the adapters.
+"""Fig. 9 of the paper: frame time against the medium's extinction, for simulation and adapters.
 
 python -m bench.density [--variant scalar_rgb llvm_ad_rgb] [--scene environment] [--size 192] [--spp 64] [--runs 3]
     [--rr-depth 5] [--quick] [--output out/bench]
 
 The material is a nearly white medium between a coat and silver. The medium hardly absorbs, so walks end only when they
-leave the material. The training range ends at sigma_t = 1. Beyond it the adapter clamps, because this bench needs its
-time and not its picture. Each of the --runs rounds renders all BSDFs at all extinctions in turns; times are medians.
-`nma curves` runs the network when the scene is loaded, `nma online` at every shading point. Flatness is the largest
-time over all extinctions, divided by the smallest.
+leave the material. The adapter was trained for extinctions up to sigma_t = 1, and clamps larger extinctions to 1. Its
+picture is wrong there, but this bench needs only the time. Each of the --runs rounds renders one frame with every BSDF
+at every extinction; the reported times are medians over the rounds. `nma curves` runs the network when the scene is
+loaded, `nma online` at every shading point. The flatness of a BSDF is its longest time over all extinctions, divided by
+its shortest time.
 
 Writes density.json and density.png.
 """
@@ -58,7 +59,7 @@ def parse() -> argparse.Namespace:
 
 
 def bsdfs(sigma: float) -> dict[str, dict[str, Any]]:
-    """The BSDFs that are compared, by name."""
+    """Returns the BSDFs to compare, by name."""
     white = nma.load_material("frosted-silver").changed(MATERIAL | {"sigma_t": sigma})
     subject = scenes.Subject(white)
     curves = scenes.adapter(subject, DEFAULT_ADAPTER, clamp=True)
@@ -71,7 +72,7 @@ def bsdfs(sigma: float) -> dict[str, dict[str, Any]]:
 
 
 def measure(variant: str, arguments: argparse.Namespace) -> Seconds:
-    """Returns the median seconds of a frame, by BSDF and extinction."""
+    """Returns the median seconds per frame, by BSDF and extinction."""
     every: dict[str, dict[float, list[float]]] = {}
     size, make = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
     with frames.bar(variant, "extinctions", arguments.runs * len(arguments.sigma)) as advance:
@@ -88,12 +89,12 @@ def measure(variant: str, arguments: argparse.Namespace) -> Seconds:
 
 
 def flatness(times: dict[float, float]) -> float:
-    """The longest time divided by the shortest; 1 means that all times are equal."""
+    """Returns the longest time divided by the shortest; 1 means that all times are equal."""
     return max(times.values()) / min(times.values())
 
 
 def plot(seconds: dict[str, Seconds], arguments: argparse.Namespace, path: Path) -> None:
-    """Draws the times over the extinction, one panel for each renderer."""
+    """Plots frame time against extinction, with one panel for each renderer."""
     figure = Figure(figsize=(1.0 + 4.6 * len(seconds), 3.8), layout="constrained")
     for axes, (variant, by_bsdf) in zip(
         np.atleast_1d(figure.subplots(1, len(seconds))), seconds.items(), strict=True
@@ -106,7 +107,7 @@ def plot(seconds: dict[str, Seconds], arguments: argparse.Namespace, path: Path)
         axes.set_xscale("symlog", linthresh=1.0, linscale=1.0)
         axes.set_xticks(arguments.sigma, [f"{sigma:g}" for sigma in arguments.sigma])
         axes.set(title=variant, xlabel="extinction $\\sigma_t$")
-        # The legend needs room above the curves.
+        # The factor 1.6 leaves room for the legend above the curves.
         axes.set_ylim(0.0, 1.6 * max(max(times.values()) for times in by_bsdf.values()))
         axes.grid(alpha=0.3)
         axes.legend(title="largest to smallest", fontsize="small", loc="upper left")

@@ -1,4 +1,4 @@
-"""Gives Dr.Jit an empty cache of kernels, so that every kernel is compiled. Import this module before Dr.Jit."""
+"""Gives Dr.Jit an empty kernel cache, so that every kernel is compiled. Import this module before Dr.Jit."""
 
 import os
 import sys

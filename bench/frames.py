@@ -1,10 +1,11 @@
-"""How the benches of whole frames measure: in turns, with independent seeds, and against converged pictures.
+"""Shared by the benches that render whole frames: rendering with independent seeds, variance, error and efficiency.
 
-Two figures tell how good a frame is. The variance is that of frames with independent seeds, averaged over pixels and
-channels; it measures noise only. The squared error is the mean squared difference from a converged picture of
-`layered`. For an adapter it contains noise and bias. The converged picture has noise of its own, which is estimated
-from its independent parts and subtracted. So the squared error of `layered` equals its variance. An efficiency is
-1 / (variance x seconds) or 1 / (error x seconds).
+The quality of a frame is measured by its variance and by its squared error. The variance is computed over frames with
+independent seeds, and averaged over pixels and channels; it measures noise only. The squared error is the mean squared
+difference between a frame and a converged picture of `layered`. The squared error of an adapter contains noise and
+bias. The converged picture also has noise; this noise is estimated from the picture's independent parts, and
+subtracted. `layered` has no bias, so its expected squared error equals its variance. The efficiency by variance is
+1 / (variance x seconds), the efficiency by error is 1 / (squared error x seconds).
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ from nma.render.progressive import render_passes
 
 ROOT = Path(__file__).parents[1]
 Array = NDArray[np.float64]
-Row = Mapping[str, Any]  # figures by name; an unknown figure is None
+Row = Mapping[str, Any]  # error measures and times by name; None stands for an unknown value
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
 OUTPUT = Path("out/bench")
 REFERENCES = ROOT / "out/bench/references"
-# The most samples that a frame renders in one pass. More would need too much memory.
+# Frames with more samples than this are rendered in several passes, because one pass would need too much memory.
 MOST_SAMPLES = 1 << 23
-# A converged picture is rendered in this many parts. The spread of the parts gives the picture's noise.
+# A converged picture is the mean of this many independent pictures (parts). Their variance gives the noise of the mean.
 PARTS, TEASER_PARTS = 4, 16
-# Converged pictures use seeds from here on. Frames use smaller ones.
+# Converged pictures use seeds from REFERENCE_SEED upwards, frames use smaller seeds.
 REFERENCE_SEED = 1_000_000
-EVEN = 1.1  # two efficiencies that differ by less than this factor are called even
+EVEN = 1.1  # the verdict is "even" if two efficiencies differ by less than this factor
 
 
 class Frames(NamedTuple):
-    """Several frames of one scene: pictures (runs, height, width, 3), wall seconds and processor seconds (runs,)."""
+    """Frames of one scene: pictures (runs, height, width, 3), and wall and processor seconds of each frame (runs,)."""
 
     pictures: Array
     wall: Array
@@ -63,16 +64,17 @@ class Frames(NamedTuple):
 
 
 class Converged(NamedTuple):
-    """A picture (height, width, 3) of many samples, and the mean square of its remaining noise."""
+    """A picture (height, width, 3) with many samples per pixel, and the mean square of its remaining noise."""
 
     picture: Array
     noise: float
 
 
 def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[int]) -> dict[str, Frames]:
-    """Renders one frame of every scene (a dictionary, by name) for each seed, and returns the frames by name.
+    """Renders one frame of every scene for each seed, and returns the frames by the scene's name.
 
-    The scenes take turns, so that other load on the machine slows all of them alike.
+    All scenes are rendered with one seed before the next seed is used, so that other load on the machine slows all
+    scenes alike.
     """
     turn = _turns(scenes, spp)
     found: dict[str, list[tuple[Array, float, float]]] = {name: [] for name in scenes}
@@ -85,7 +87,7 @@ def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[
 def _turns(
     scenes: Mapping[str, Mapping[str, Any]], spp: int
 ) -> Callable[[str, int], tuple[Array, float, float]]:
-    """Returns a function of a scene's name and a seed. It renders a frame and returns the result of `timed`."""
+    """Returns a function that renders a frame for a scene's name and a seed, and returns the result of `timed`."""
     import mitsuba as mi
 
     if mi.variant() == SCALAR:
@@ -93,8 +95,8 @@ def _turns(
         return lambda name, seed: timed(loaded[name], spp, seed)
 
     def alone(name: str, seed: int) -> tuple[Array, float, float]:
-        # A vectorised renderer traces all BSDFs in memory for every frame, so only one scene may be loaded at a time.
-        # The first frame compiles the kernel, or finds it in the cache since the last turn.
+        # A vectorised renderer traces the code of every BSDF in memory, so only one scene may be loaded at a time. The
+        # first frame compiles the kernel, or loads the kernel from Dr.Jit's cache, so this frame is not measured.
         gc.collect()
         scene = load_dict(scenes[name])
         timed(scene, spp, seed)
@@ -104,8 +106,8 @@ def _turns(
 
 
 def timed(scene: Any, spp: int, seed: int) -> tuple[Array, float, float]:
-    """Renders a loaded scene; returns the picture (height, width, 3), wall seconds, and processor seconds of all
-    threads."""
+    """Renders a loaded scene. Returns the picture (height, width, 3), the wall seconds, and the processor seconds
+    summed over all threads."""
     width, height = scene.sensors()[0].film().crop_size()
     before, began = processor_seconds(), time.perf_counter()
     if spp * int(width) * int(height) <= MOST_SAMPLES:
@@ -116,7 +118,7 @@ def timed(scene: Any, spp: int, seed: int) -> tuple[Array, float, float]:
 
 
 def processor_seconds() -> float:
-    """Processor seconds that all threads of this process have used so far."""
+    """Returns the processor seconds that all threads of this process have used so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 
@@ -128,13 +130,13 @@ def converged(
     parts: int = PARTS,
     advance: Callable[[], object] = lambda: None,
 ) -> Converged:
-    """Renders a picture of `spp` samples per pixel in independent parts.
+    """Renders a picture with `spp` samples per pixel as the mean of independent parts.
 
     Args:
         description: the scene, as a dictionary.
-        keep: the start of the paths under which parts are saved; a part that has a file is not rendered again.
-        parts: how many parts.
-        advance: called after each part.
+        keep: prefix of the paths of the files that store the parts. A part whose file exists is not rendered again.
+        parts: number of parts.
+        advance: a function that is called after each part.
     """
     pictures, scene = [], None
     for number in range(parts):
@@ -152,7 +154,7 @@ def converged(
 
 
 def converged_teaser(description: Mapping[str, Any], arguments: argparse.Namespace) -> Converged:
-    """The converged picture of the teaser. Its parts are kept in REFERENCES; a progress bar counts them."""
+    """Returns the converged picture of the teaser, and stores the picture's parts in the folder REFERENCES."""
     settings = f"{arguments.size}px_rr-{arguments.rr_depth}_{arguments.variant}"
     keep = REFERENCES / f"teaser-{digest()}_{settings}"
     with bar("converged picture", "parts", TEASER_PARTS) as advance:
@@ -160,14 +162,14 @@ def converged_teaser(description: Mapping[str, Any], arguments: argparse.Namespa
 
 
 def squared_errors(pictures: Array, reference: Converged) -> Array:
-    """The squared error of each frame (runs,), averaged over pixels and channels."""
+    """Returns the squared error of each frame (runs,), averaged over pixels and channels."""
     return ((pictures - reference.picture) ** 2).mean(axis=(1, 2, 3)) - reference.noise
 
 
 def figures(frames: Frames, reference: Converged | None = None) -> dict[str, float | None]:
-    """Returns the seconds and the variance of a frame, and its squared error if there is a converged picture.
+    """Returns the median seconds and the variance of the frames, and their mean squared error if a reference is given.
 
-    `doubt` is the standard error of the squared error over the runs, divided by the squared error.
+    `doubt` is the standard error of the mean squared error, estimated over the frames, divided by the squared error.
     """
     found: dict[str, float | None] = {"seconds": frames.seconds, "variance": frames.variance}
     if reference is None:
@@ -178,7 +180,7 @@ def figures(frames: Frames, reference: Converged | None = None) -> dict[str, flo
 
 
 def ratios(own: Row, simulation: Row) -> dict[str, Any]:
-    """Time, variance, error and efficiencies, relative to the simulation's. A ratio is None if a figure is unknown."""
+    """Returns time, variance, error and efficiencies relative to the simulation's; None for every unknown ratio."""
     time, variance, error = (ratio(own[key], simulation[key]) for key in ("seconds", "variance", "error"))
     return {
         "time": time,
@@ -190,18 +192,18 @@ def ratios(own: Row, simulation: Row) -> dict[str, Any]:
 
 
 def ratio(a: float | None, b: float | None) -> float | None:
-    """a / b. None if one of them is unknown, or not positive: an error near 0 can come out negative, by noise."""
+    """Returns a / b, or None if a or b is None or not positive. Noise can make a small error negative."""
     return a / b if a and b and a > 0.0 and b > 0.0 else None
 
 
 def geometric_mean(values: Iterable[float | None]) -> float | None:
-    """The geometric mean of the values that are not None; None if there are none."""
+    """Returns the geometric mean of the values that are not None, or None if all values are None."""
     logs = [math.log(value) for value in values if value is not None]
     return math.exp(sum(logs) / len(logs)) if logs else None
 
 
 def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str, dict[str, Any]]:
-    """The ratios to the simulation, as geometric means over materials, by BSDF."""
+    """Returns the ratios of every BSDF to the simulation, as geometric means over materials."""
     each = [{name: ratios(row[name], row[simulation]) for name in row} for row in rows]
     return {
         name: {key: geometric_mean(row[name][key] for row in each) for key in each[0][name]}
@@ -210,13 +212,13 @@ def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str,
 
 
 def mean_doubt(rows: Sequence[Mapping[str, Row]], name: str, simulation: str) -> float | None:
-    """The standard error of the mean ratio of errors, divided by this ratio; None if there is no error."""
+    """Returns the relative standard error of the mean ratio of squared errors, or None if an error was not measured."""
     doubts = [row[bsdf]["doubt"] for row in rows for bsdf in (name, simulation)]
     return None if None in doubts else math.hypot(*doubts) / len(rows)
 
 
 def verdict(efficiency: float | None) -> str:
-    """What to render with: "adapter", "simulation", "even" or "-" (unknown).
+    """Returns which is more efficient: "adapter", "simulation", "even" or "-" (unknown).
 
     Args:
         efficiency: the adapter's efficiency by error, relative to the simulation's.
@@ -229,7 +231,7 @@ def verdict(efficiency: float | None) -> str:
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table with aligned columns: text on the left, numbers on the right."""
+    """Returns a Markdown table. Columns of text are aligned on the left, columns of numbers on the right."""
     cells = [list(headings), *([_cell(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     text = [all(row[n] == "-" or not _is_number(row[n]) for row in cells[1:]) for n in range(len(headings))]
@@ -262,7 +264,7 @@ def _is_number(text: str) -> bool:
 
 
 def parser(doc: str | None, size: int, spp: int, runs: int) -> argparse.ArgumentParser:
-    """A command-line parser with the options of every bench of frames; `doc` is the script's docstring."""
+    """Returns a parser with the options that all benches of frames share; `doc` is the script's docstring."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--size", type=int, default=size, help="height of the pictures, in pixels")
     made.add_argument("--spp", type=int, default=spp, help="samples per pixel of a frame")
@@ -278,7 +280,7 @@ def parser(doc: str | None, size: int, spp: int, runs: int) -> argparse.Argument
 
 
 def parse(made: argparse.ArgumentParser, **quick: Any) -> argparse.Namespace:
-    """Parses the command line. With --quick, the values in `quick` replace some of the arguments."""
+    """Parses the command line. With --quick, the keyword arguments `quick` replace the options of the same name."""
     arguments = made.parse_args()
     if arguments.quick:
         vars(arguments).update(quick)
@@ -293,12 +295,12 @@ def settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def write(path: Path, head: str, arguments: argparse.Namespace, **data: Any) -> None:
-    """Writes the results `data` as JSON, after the machine's header `head` and the settings."""
+    """Writes a JSON file with the header `head` (bench/machine.py), the settings and the results `data`."""
     common.write_json(path, {"machine": head.splitlines(), "settings": settings(arguments)} | data)
 
 
 def begin(variant: str | None = None) -> str:
-    """Prints the machine's header and returns it. Sets Mitsuba's variant, if one is given."""
+    """Prints and returns the header of bench/machine.py, and sets Mitsuba's variant if `variant` is given."""
     head = header()
     print(head, flush=True)
     if variant:
@@ -308,7 +310,7 @@ def begin(variant: str | None = None) -> str:
 
 @contextmanager
 def bar(what: str, unit: str, total: int) -> Iterator[Callable[[], None]]:
-    """Shows a progress bar of `total` steps. Call the function that it yields after each step."""
+    """Shows a progress bar of `total` steps, and yields the function to call after each step."""
     with progress(f"{unit}/min") as shown:
         task = shown.add_task(what, total=total, rate="", note="")
 

@@ -1,12 +1,13 @@
-"""What a network costs in a vectorised frame: the time over the network's multiply-adds.
+"""Frame time in a vectorised renderer against the size of the adapter's network, counted in multiply-adds.
 
 python -m bench.networks [--scene lights] [--networks 1x16 3x32 3x64 5x64] [--size 160] [--spp 48] [--runs 5]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-A whole frame is one kernel, and no profiler can look into it. So this bench renders a textured material with adapters
-that differ only in the size of their network; the weights are random. A line is fitted to their times. The line's value
-at size 0 is the time of everything except the network. The simulation and `principled` are rendered for comparison.
-BSDFs take turns; times are medians.
+A vectorised renderer compiles a whole frame into one kernel, so a profiler cannot separate the network's time. This
+bench therefore renders a textured material with adapters that differ only in the size of their network; the weights are
+random. A straight line is fitted to frame time against multiply-adds. The line's value at 0 multiply-adds is the time
+of everything except the network. The simulation and `principled` are rendered for comparison. Every run renders one
+frame with each BSDF; the reported times are medians over the runs.
 
 Writes networks.json and networks.png.
 """
@@ -70,7 +71,7 @@ def parse() -> argparse.Namespace:
 
 
 def random_adapter(name: str) -> nma.Adapter:
-    """The shipped adapter, but with a network of the size `name` and random weights."""
+    """Returns the default adapter, but with a network of the size `name` (such as "3x32") and random weights."""
     trained = nma.Adapter.load(DEFAULT_ADAPTER)
     ends = trained.layers[0][0].shape[1], trained.layers[-1][0].shape[0]
     sizes = [ends[0], *network.hidden(name), ends[1]]
@@ -79,7 +80,7 @@ def random_adapter(name: str) -> nma.Adapter:
 
 
 def multiply_adds(adapter: nma.Adapter) -> int:
-    """The multiply-adds that the adapter's network needs for one query."""
+    """Returns the number of multiply-adds that the adapter's network needs for one query."""
     return sum(matrix.size for matrix, _ in adapter.layers)
 
 

@@ -2,13 +2,15 @@
 
 python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
 
-An adapter prepares its blend at the view direction, so f(wi, wo) and f(wo, wi) are two different functions. A path from
-the camera uses the first, a path from the light would use the second. This bench needs no renderer: it averages both
-functions over directions that are drawn from the blend's own samples. For every named material it prints:
+An adapter's network computes the blend's parameters for the view direction, so f(wi, wo) and f(wo, wi) differ. Paths
+from the camera use f(wi, wo), paths from a light would use f(wo, wi). This bench needs no renderer: it averages both
+functions over directions wo that are sampled from the blend. It prints a table with a row for each named material and
+these columns:
 
-difference      mean of |f(wi, wo) - f(wo, wi)| over all pairs, weighted by both cosines, divided by the mean of f
-cos .9, .5, .2  relative change of brightness if the two directions are swapped, for a surface that is seen at this
-                cosine under a uniform sky
+difference      the mean of |f(wi, wo) - f(wo, wi)| over all pairs of directions, weighted by both cosines and divided
+                by the mean of f
+cos .9, .5, .2  the relative change of brightness under a uniform sky if the two directions are swapped, for a surface
+                that is seen at the cosine .9, .5 or .2
 
 Writes reciprocity.json.
 """
@@ -32,7 +34,7 @@ COSINES = (0.9, 0.5, 0.2)
 
 
 class Pairs(NamedTuple):
-    """f(wi, wo) and f(wo, wi), each (3, n), for directions wo drawn for wi; divided by the density of wo."""
+    """f(wi, wo) cos(theta_o) and f(wo, wi) cos(theta_o), each (3, n), divided by the probability density of wo."""
 
     forward: NDArray
     swapped: NDArray
@@ -70,7 +72,7 @@ def percent(values: list[float]) -> str:
 
 
 def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[float]]:
-    """Returns the figures of one material by column, each with a value for R, G and B."""
+    """Returns one row of the table: the values of R, G and B for each column."""
     rng = np.random.default_rng(0)
     every = pairs(adapter, params, np.sqrt(rng.random(samples)), rng)
     off = np.abs(every.forward - every.swapped).mean(axis=1) / every.forward.mean(axis=1)
@@ -82,23 +84,23 @@ def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[
 
 
 def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Generator) -> Pairs:
-    """Takes one view direction for each cosine, and draws one light direction for it from the adapter's blend."""
+    """Samples the adapter's blend: one light direction for each view direction, which is given by its cosine."""
     n = len(cosines)
     wi = at_azimuth_0(cosines)
     brdf = prepared(adapter, params, wi)
-    # The number that chooses the lobe is stratified.
+    # The random numbers that choose the lobe are stratified.
     u = rng.permutation((np.arange(n) + rng.random(n)) / n), *rng.random((2, n))
     wo, value, pdf = brdf.sample(wi, *u)
     valid = (pdf > 0.0) & (wo.z > 1e-4)
     wo = Vec3(*(np.where(valid, x, up) for x, up in zip(wo, (0.0, 0.0, 1.0), strict=True)))
-    # The swapped evaluation returns f cos(theta_i); we need f cos(theta_o).
+    # The swapped evaluation returns f(wo, wi) cos(theta_i); we need f(wo, wi) cos(theta_o).
     back = np.stack(prepared(adapter, params, wo).eval(wo, wi)) * wo.z / wi.z
     weight = np.where(valid, 1.0 / np.where(valid, pdf, 1.0), 0.0)
     return Pairs(np.stack(value) * weight, back * weight)
 
 
 def prepared(adapter: Adapter, params: NDArray, w: Vec3) -> Brdf:
-    """One material seen from every direction `w`."""
+    """Returns the BRDF of one material, prepared for the view directions `w`."""
     return adapter.prepare([np.full(len(w.z), x) for x in params], w)
 
 

@@ -1,22 +1,23 @@
-"""Time, variance and error of `principled`, `layered` and `nma` in the preview scene, without textures and with three.
+"""Time, variance and error of `principled`, `layered` and `nma` in the preview scene, with no textures and with three.
 
     python -m bench.render [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
 
-All BSDFs take turns, so that other load on the machine slows all of them alike. The columns are:
+Every run renders one frame with each BSDF, so that other load on the machine slows all BSDFs alike. The columns are:
 
 time        median wall time of a frame, without compilation; cpu: the same in processor seconds
 ratio       a frame's time relative to `principled` in the same round, median over rounds
 compile     extra time of the first frame over the second, with an empty cache of kernels and no other BSDF
 variance    variance of one frame over independent seeds, averaged over pixels and channels
 efficiency  1 / (variance x time)
-bias        root mean square difference between the expected picture and that of `layered`, from products of
-            independent renderings; if it is hidden in the noise, an upper limit (<)
-smape       SMAPE of the mean of the frames against the reference; the line of `layered` shows the part that is noise
-load        average load of the machine, printed at the start and at the end
+bias        root mean square difference between the expected picture and that of `layered`, estimated from products of
+            independent renderings; an upper limit (<) if the bias is not larger than its statistical error
+smape       SMAPE between the mean of the frames and the reference; in the row of `layered`, this error is noise only
 
-`principled` shows another material; only its time and noise are of interest.
+The machine's load average is printed before and after the table. `principled` shows another material, so only its time
+and its noise are of interest.
 
-Writes render.json and render.png. The plot shows the expected error over the rendering time, from variance and bias.
+Writes render.json and render.png. The plot shows the expected error against the rendering time; the expected error is
+computed from variance and bias.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def parse() -> argparse.Namespace:
 
 
 def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
-    """For each scene, the BSDFs by name. `layered` and `nma` show the same material; `principled` shows another one."""
+    """Returns the BSDFs to compare, by scene and name. `layered` and `nma` show the same material."""
     for name in adapters:
         if name not in shipped() and not Path(name).is_file():
             raise SystemExit(f"no adapter {name}: give a weights file or one of {', '.join(shipped())}")
@@ -105,9 +106,9 @@ def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def compile_seconds(description: dict[str, Any], spp: int) -> float:
-    """How many seconds longer the first frame takes than the second.
+    """Returns how many seconds longer the first frame takes than the second.
 
-    Mitsuba compiles all BSDFs in memory, so those of other scenes are deleted first.
+    Mitsuba compiles every BSDF in memory, so the BSDFs of other scenes are deleted first.
     """
     gc.collect()
     scene = load_dict(description)
@@ -116,13 +117,13 @@ def compile_seconds(description: dict[str, Any], spp: int) -> float:
 
 
 def converged_halves(description: dict[str, Any], spp: int) -> list[Array]:
-    """Two independent pictures (height, width, 3) of `spp` / 2 samples each."""
+    """Renders two independent pictures (height, width, 3), each with `spp` / 2 samples per pixel."""
     scene = load_dict(description)
     return [render_passes(scene, spp // 2, seed=seed).astype(np.float64) for seed in (12345, 54321)]
 
 
 def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array]) -> dict[str, Any]:
-    """Returns the figures of one BSDF in one scene.
+    """Returns one row of the table: the results of one BSDF in one scene.
 
     Args:
         scene: the scene's name.
@@ -152,10 +153,10 @@ def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array])
 
 
 def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
-    """The mean over pixels and channels of (expectation - truth)^2, and its standard error.
+    """Estimates the squared bias, averaged over pixels and channels, and the standard error of the estimate.
 
-    Each term is a product of two differences: one frame less one half, another frame less the other half. The two
-    differences share no sample, so their noise has mean 0 in the product. All pairs of frames are used.
+    For each pair of frames (a, b), the estimate averages (a - halves[0]) (b - halves[1]). The two factors share no
+    samples, so the noise has mean 0 in the product.
     """
     a, b = pictures - halves[0], pictures - halves[1]
     pairs = len(pictures) * (len(pictures) - 1)
@@ -164,13 +165,13 @@ def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
 
 
 def bias(row: dict[str, Any]) -> float | None:
-    """The root of the squared bias, or None if the squared bias is below two of its standard errors."""
+    """Returns the root of the squared bias, or None if the squared bias is at most twice its standard error."""
     square, error = row["squared_bias"], row["squared_bias_error"]
     return float(np.sqrt(square)) if square > 2.0 * error else None
 
 
 def line(row: dict[str, Any]) -> str:
-    """Formats a row as one line of the printed table."""
+    """Formats a row of the results as a line of the printed table."""
     text = (
         f"{row['scene']:9} {row['bsdf']:19} {row['seconds']:7.2f} {row['seconds_ratio']:6.2f} {row['cpu']:6.2f} "
         f"{row['cpu_ratio']:6.2f} {row['compile']:9.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"
@@ -183,7 +184,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draws the expected root mean square error over rendering time, one panel for each scene."""
+    """Plots the expected root mean square error against rendering time, with one panel for each scene."""
     names = list(dict.fromkeys(row["scene"] for row in rows))
     figure = Figure(figsize=(5.0 * len(names), 3.8), layout="constrained")
     panels = figure.subplots(1, len(names), sharey=True)

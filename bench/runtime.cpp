@@ -2,7 +2,8 @@
 //
 //     ./runtime NAME=WEIGHTS ...
 //
-// A figure is the time per query in nanoseconds: 240 random queries on one thread, best of many repetitions.
+// Each measurement answers 240 random queries on one thread, many times. The result is the shortest time, in
+// nanoseconds per query.
 #include "nma.h"
 
 #include <chrono>
@@ -22,7 +23,8 @@ volatile float sink;
 
 double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
-// Nanoseconds per query. `all` is a function that answers every query once.
+// Returns the shortest time, in nanoseconds per query, of several calls of `all`, a function that answers every query
+// once.
 template <class F>
 double best(F all, int repetitions = REPETITIONS) {
     double least = 1e30;
@@ -94,7 +96,7 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
         adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), brdfs.data());
     }));
     if (options.compact || options.set != nma::fastest()) return;
-    // The rest does not depend on the instruction set.
+    // The functions below do not depend on the instruction set, so they are measured only once.
     const nma::Curves curves(adapter, queries.parameters.data());
     report(network, "curves", "any", best([&] {
         for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weight(0);
@@ -110,7 +112,8 @@ void time_adapter(const std::string& network, const std::string& path, nma::Opti
     }));
 }
 
-// Measures a network of zeros without an adapter: on one query after the other, and on all queries together.
+// Measures a network without an adapter, first on one query at a time, then on all queries in one batch. All of the
+// network's weights are .01.
 void time_network(const std::string& name, const std::vector<int>& sizes, nma::InstructionSet set, bool compact,
                   int repetitions = REPETITIONS) {
     std::vector<nma::Layer> layers;
@@ -168,7 +171,8 @@ void time_eigen(const std::string& name, const std::vector<int>& sizes) {
 }
 #endif
 
-// The most multiply-adds per nanosecond that this core can do, measured with independent chains of them.
+// Returns the highest rate of this core, in multiply-adds per nanosecond, measured with independent chains of
+// multiply-adds.
 NMA_TARGET("avx512f,fma") double peak_avx512() {
 #ifdef NMA_X86
     __m512 sums[12];
@@ -197,7 +201,7 @@ int main(int count, char** words) {
     if (nma::supported(InstructionSet::avx512)) report("", "peak multiply-adds per ns", "avx512", peak_avx512());
     const std::pair<const char*, std::vector<int>> networks[] = {{"5x64", {16, 64, 64, 64, 64, 64, 23}},
                                                                  {"3x32", {16, 32, 32, 32, 23}}};
-    // A decoder of the size of Fan et al. 2022: 1.07 M numbers.
+    // A decoder with about as many parameters as the decoder of Fan et al. 2022: 1.07 million.
     const std::vector<int> large{38, 512, 512, 512, 512, 512, 3};
     for (const InstructionSet set : nma::INSTRUCTION_SETS) {
         if (!nma::supported(set)) continue;

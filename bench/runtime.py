@@ -1,9 +1,9 @@
-"""Times of the C++ runtime in nanoseconds, by instruction set; also of Eigen, NumPy, drjit.nn and a large decoder.
+"""Times per query of the C++ runtime, by instruction set, and of a large decoder, Eigen, NumPy and drjit.nn.
 
 python -m bench.runtime [--json OUT.json]
 
-Each time is the best of many repetitions on one thread. Eigen is measured if its headers are installed (Debian:
-libeigen3-dev). The decoder has 1.07 M numbers.
+Times are in nanoseconds on one thread. Each time is the shortest of many repetitions. Eigen is measured if its headers
+are installed (Debian: libeigen3-dev). The decoder has 1.07 million parameters.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-# This must be set before NumPy starts its threads.
+# The number of threads must be set before NumPy starts its threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import drjit as dr
@@ -65,8 +65,8 @@ def main() -> None:
 
 
 def cpp() -> list[dict]:
-    """Compiles bench/runtime.cpp for this machine, runs it, and returns its rows. Kernels choose their instruction sets
-    when they run."""
+    """Compiles bench/runtime.cpp for this machine, runs it, and returns its measurements. The runtime's
+    kernels choose their instruction set when the program runs."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "runtime"
         flags = ["-std=c++17", "-O2", "-march=native", f"-I{build.sources()}"]
@@ -93,7 +93,7 @@ def python(name: str) -> list[dict]:
 
 
 def drjit_nn(layers: list, many: np.ndarray) -> float:
-    """Seconds per query of drjit.nn with packed float16 weights; a first run compiles and is not counted."""
+    """Returns the seconds per query of drjit.nn with packed float16 weights, without the time of compilation."""
     ensure_llvm()
     import drjit.nn as nn
     from drjit.llvm import Float16, Float32, TensorXf16

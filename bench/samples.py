@@ -1,13 +1,13 @@
-"""Fig. 8 of the paper: squared error and variance of the teaser over samples per pixel and over seconds.
+"""Fig. 8 of the paper: squared error and variance of the teaser against samples per pixel and against seconds.
 
 python -m bench.samples [--variant scalar_rgb] [--size 144] [--spp 1024] [--runs 3] [--reference-spp 8192]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-Frames have 1, 2, 4 ... --spp samples per pixel. Each number of samples is rendered at least --runs times; BSDFs take
-turns. The squared error is measured against a converged picture of `layered`, and the noise of this picture is
-subtracted. The simulation's error falls without end, an adapter's falls to its squared bias. The parts of the converged
-picture are kept in out/bench/references, so a killed run continues where it stopped. bench/frames.py defines variance,
-error and efficiency.
+Frames are rendered with 1, 2, 4 ... --spp samples per pixel. For each of these sample counts, at least --runs frames
+are rendered with each BSDF. The squared error is measured against a converged picture of `layered`, and the noise of
+this picture is subtracted. With more samples, the simulation's error falls towards 0, but an adapter's error falls only
+to its squared bias. The parts of the converged picture are kept in out/bench/references, so a killed run continues
+where it stopped. bench/frames.py defines variance, error and efficiency.
 
 Writes samples.json and samples.png.
 """
@@ -25,7 +25,7 @@ import nma
 from bench import frames, scenes
 from figures import common
 
-# A frame of fewer samples per pixel is rendered more often: CHEAP / samples times for each run.
+# With fewer than CHEAP samples per pixel, CHEAP / spp frames are rendered for each of the --runs frames.
 CHEAP = 32
 Curve = dict[int, dict[str, float | None]]
 
@@ -53,7 +53,7 @@ def parse() -> argparse.Namespace:
 
 
 def describe(arguments: argparse.Namespace) -> dict[str, dict]:
-    """The teaser scene with each BSDF, by name."""
+    """Returns the teaser scene with each BSDF, by the BSDF's name."""
     size = scenes.teaser_size(arguments.size)
     models: dict[str, Callable[[scenes.Subject], scenes.Bsdf]] = {scenes.SIMULATION: scenes.simulation}
     for name in reversed(nma.shipped()):
@@ -77,17 +77,17 @@ def measure(
 
 
 def repeats(spp: int, runs: int) -> int:
-    """How many frames to render. Frames of few samples cost little and vary most, so there are more of them."""
+    """Returns how many frames to render. More are rendered with few samples: they take little time and vary most."""
     return runs * max(1, CHEAP // spp)
 
 
 def levels(spp: int) -> list[int]:
-    """The powers of two up to `spp`: 1, 2, 4 ..."""
+    """Returns the powers of two up to `spp`: 1, 2, 4 ..."""
     return [2**n for n in range(spp.bit_length())]
 
 
 def table(curves: dict[str, Curve]) -> str:
-    """A table with a line for each number of samples: the simulation's figures, and the adapters' relative to them."""
+    """Returns a table by samples per pixel: the simulation's results, and the adapters' ratios to the simulation."""
     truth = curves[scenes.SIMULATION]
     headings, rows = ["spp", "seconds", "variance", "error"], []
     for name in curves:
@@ -104,7 +104,7 @@ def table(curves: dict[str, Curve]) -> str:
 
 
 def plot(curves: dict[str, Curve], arguments: argparse.Namespace, path: Path) -> None:
-    """Draws the error over samples and over seconds; the variance is dotted."""
+    """Plots the error against samples per pixel and against seconds, with the variance as dotted curves."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     for number, (name, curve) in enumerate(curves.items()):

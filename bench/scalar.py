@@ -1,16 +1,16 @@
-"""Table 4 of the paper: simulation and adapters in Mitsuba's scalar renderer, on unseen materials, at equal samples.
+"""Table 4 of the paper: simulation and adapters in `scalar_rgb`, on unseen materials, at equal samples per pixel.
 
 python -m bench.scalar [--scene sphere|environment|preview|lights] [--materials 92] [--size 96] [--spp 32] [--runs 3]
     [--error 8] [--reference-spp 2048] [--rr-depth 5] [--quick] [--output out/bench]
 
-For each material the BSDFs take turns, so that other load on the machine slows all of them alike. A frame's time is the
-median of its runs on all cores. bench/frames.py defines variance, error and efficiency. The error is measured for
---error of the materials. All figures are ratios to `layered`, as geometric means over the materials: a time below 1 is
-faster, an efficiency above 1 is better. `online` runs the network at every shading point, `curves` runs no network.
-`principled` and `diffuse` show other materials: `principled` stands for the time of a production BSDF, `diffuse` for
-the time of everything except the material.
+For each material, every run renders one frame with each BSDF, so that other load on the machine slows all BSDFs alike.
+The time of a BSDF is the median over its frames, rendered on all cores. bench/frames.py defines variance, error and
+efficiency. The error is measured for the first --error materials only. All results are ratios to `layered`, as
+geometric means over the materials. A time below 1 is faster, an efficiency above 1 is better. `online` runs the network
+at every shading point, `curves` runs no network. `principled` and `diffuse` show other materials: `principled` measures
+the time of a production BSDF, and `diffuse` the time of everything except the material.
 
-Writes scalar.json and scalar.png for the default scene, and scalar-SCENE.json and scalar-SCENE.png for any other.
+Writes scalar.json and scalar.png for the default scene, and scalar-SCENE.json and scalar-SCENE.png for another scene.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def parse() -> argparse.Namespace:
 
 
 def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
-    """The BSDFs that are compared, by name."""
+    """Returns the BSDFs to compare, by name."""
     found = {scenes.SIMULATION: scenes.simulation(subject)}
     for name in nma.shipped():
         found[f"{scenes.short(name)} online"] = scenes.network(subject, name)
@@ -82,7 +82,7 @@ def compare(subject: scenes.Subject, number: int, arguments: argparse.Namespace)
     """Returns seconds and variance of every BSDF; for the first --error materials, also the squared error."""
     size, scene = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
     described = {name: scene(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs(subject).items()}
-    # Each material has its own seeds. With equal seeds, the noise of all materials would be alike.
+    # Each material has its own seeds, because equal seeds would give all materials similar noise.
     seeds = range(number * arguments.runs, (number + 1) * arguments.runs)
     measured = frames.in_turns(described, arguments.spp, seeds)
     reference = None
@@ -95,7 +95,7 @@ def compare(subject: scenes.Subject, number: int, arguments: argparse.Namespace)
 
 
 def plot(rows: list[Figures], scene: str, path: Path) -> None:
-    """Draws the time and the efficiency of every material, sorted, with the paper's means as lines."""
+    """Plots the sorted times and efficiencies of all materials, with the paper's means as lines."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     for name in rows[0]:

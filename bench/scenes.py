@@ -1,4 +1,4 @@
-"""What the benches of whole frames render: the scenes, the materials, and the BSDFs that show a material."""
+"""The scenes, materials and BSDFs that the benches render."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from nma.render.scene import Camera, preview_scene
 from nma.render.shaderball import shader_ball_file
 from nma.render.textures import bitmap_texture, periodic_noise, procedural_textures
 
-DEPTH, RR_DEPTH = 6, 5  # the longest path, and the depth at which Russian roulette begins (Mitsuba's default)
+# The maximum path depth, and the depth at which Russian roulette begins (Mitsuba's default).
+DEPTH, RR_DEPTH = 6, 5
 SIMULATION, STAND_IN, NOTHING = "layered", "principled", "diffuse"
-# A frame of this BSDF takes the time of everything except the material. No BSDF can be faster.
+# A frame with this BSDF measures the time of everything except the material, because its own cost is negligible.
 DIFFUSE = {"type": "diffuse"}
 TEXELS = 512
-# Small, bright lights out of the camera's sight: direction from the ball's centre, distance, colour.
+# Small, bright lights that the camera does not see. For each light: direction from LIGHTS_AROUND, distance and colour.
 LIGHTS = (
     ((-1.00, -0.70, 0.85), 2.4, (1.00, 0.85, 0.65)),
     ((0.80, -0.50, 0.55), 2.2, (0.70, 0.85, 1.00)),
@@ -51,7 +52,7 @@ class Subject(NamedTuple):
     repeats: float = 2.0
 
     def images(self) -> dict[str, Any]:
-        """The textures as Mitsuba's textures for the current variant."""
+        """Returns the textures as dictionaries of Mitsuba's plugin `bitmap`."""
         return {name: bitmap_texture(values, scale=self.repeats) for name, values in self.textures.items()}
 
 
@@ -60,16 +61,19 @@ def simulation(subject: Subject) -> dict[str, Any]:
 
 
 def adapter(subject: Subject, name: str, clamp: bool = False) -> dict[str, Any]:
-    """The BSDF `nma` of a shipped adapter or a weights file. Without textures it renders from curves over the angle;
-    with textures it runs the network."""
+    """Returns the BSDF `nma` of a shipped adapter or a weights file.
+
+    Without textures, the BSDF interpolates curves over the viewing angle. With textures, it runs the network at every
+    shading point.
+    """
     return material_bsdf(subject.material, "nma", adapter=name, clamp=clamp) | subject.images()
 
 
 def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
-    """Makes an adapter run its network at every shading point.
+    """Returns the BSDF `nma` with the setting that makes it run its network at every shading point.
 
-    The scalar plugin has an option for this. In other variants, a texture makes the network run; if the BSDF has no
-    texture for sigma_t, it gets one of a single value.
+    In `scalar_rgb`, the setting is the option `online`. In the other variants, the network runs at every shading point
+    if a parameter has a texture, so a BSDF without a texture for sigma_t gets a constant texture.
     """
     import mitsuba as mi
 
@@ -81,24 +85,24 @@ def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
 
 
 def network(subject: Subject, name: str, precision: str = "compact") -> dict[str, Any]:
-    """The BSDF of an adapter whose network runs at every shading point."""
+    """Returns the BSDF `nma` of an adapter whose network runs at every shading point."""
     return online(adapter(subject, name), precision)
 
 
 def stand_in(subject: Subject) -> dict[str, Any]:
-    """Mitsuba's `principled` with the same textures. It shows another material; only its time and noise count."""
+    """Returns Mitsuba's `principled` with the same textures. It shows another material than `layered`."""
     names = {"albedo": "base_color", "alpha_bottom": "roughness", "sigma_t": "metallic"}
     images = {names[name]: image for name, image in subject.images().items()}
     return {"type": "principled", "metallic": 0.7, "roughness": 0.3, "clearcoat": 0.5} | images
 
 
 def short(name: str) -> str:
-    """The size of the network in an adapter's name: layered3-5x64 -> 5x64."""
+    """Returns the size of the network from an adapter's name: layered3-5x64 -> 5x64."""
     return name.split("-")[-1]
 
 
 def unseen(count: int, seed: int = 92) -> list[Subject]:
-    """Materials of the paper's ranges that no adapter was trained on."""
+    """Draws materials from the paper's ranges; no adapter was trained on them."""
     params = nma.LAYERED3.sample(np.random.default_rng(seed), count, "range")
     return [Subject(Material.of_vector(f"unseen-{n}", row, nma.LAYERED3)) for n, row in enumerate(params)]
 
@@ -178,10 +182,10 @@ SCENES: dict[str, Callable[[Bsdf, tuple[int, int], int], dict[str, Any]]] = {
 def teaser(
     model: Callable[[Subject], Bsdf], size: tuple[int, int], rr_depth: int = RR_DEPTH
 ) -> dict[str, Any]:
-    """Three shader balls, one for each textured material; `model` makes the BSDF of a material.
+    """Three shader balls, one for each textured material; `model` returns the BSDF of a material.
 
-    The light is soft. Under a sun, a few pixels would hold nearly all of the noise, and many runs would be needed to
-    tell the BSDFs apart.
+    The scene has soft lights and no sun. Under a sun, a few pixels would hold nearly all of the noise, so many more
+    frames would be needed to compare the BSDFs.
     """
     import mitsuba as mi
 
@@ -205,13 +209,15 @@ def teaser(
 
 
 def teaser_size(height: int) -> tuple[int, int]:
-    """Width and height of the teaser, in pixels."""
+    """Returns width and height of the teaser, in pixels."""
     return round(TEASER_ASPECT * height), height
 
 
 def digest() -> str:
-    """A hash of the code that makes the scenes. It is part of the names of stored pictures, so a changed scene is
-    rendered again."""
+    """Returns a hash of the code that makes the scenes.
+
+    The file names of stored pictures contain the hash, so a scene is rendered again after its code has changed.
+    """
     modules = (nma.render.scene, nma.render.lighting, nma.render.textures)
     files = [__file__, *(module.__file__ for module in modules)]
     return hashlib.sha256(b"".join(Path(str(file)).read_bytes() for file in files)).hexdigest()[:8]
@@ -222,7 +228,7 @@ def _path(rr_depth: int) -> dict[str, Any]:
 
 
 def _light(towards: tuple[float, ...], distance: float, colour: tuple[float, ...]) -> dict[str, Any]:
-    """A small spherical light. Its radiance grows with the distance, so all lights are equally bright on the ball."""
+    """A small sphere that emits light. Its radiance grows with distance^2, so all lights light the ball equally."""
     direction = np.array(towards) / np.linalg.norm(towards)
     radiance = (LIGHT_POWER * distance**2 * np.array(colour)).tolist()
     return {

@@ -1,17 +1,19 @@
-"""Simulation or adapter? Time, variance, error and efficiency, by renderer, by scene, and with or without textures.
+"""Simulation and adapters compared: time, variance, error and efficiency by renderer, scene and kind of material.
 
 python -m bench.settings [--variant scalar_rgb llvm_ad_rgb] [--scene preview lights environment] [--materials 4]
     [--size 192] [--spp 64] [--runs 4] [--reference-spp 1024] [--rr-depth 5] [--quick] [--output out/bench]
 
-Untextured materials are unseen materials of the paper's ranges; their adapters render from curves over the viewing
-angle. Textured materials are those of bench/scenes.py; their network runs at every shading point. All figures are
-ratios to `layered`, as geometric means over the materials. bench/frames.py defines variance, error and efficiency. The
-verdict compares efficiencies by error; efficiencies within 10 % are "even". `doubt` is the relative standard error of
-this efficiency over the runs. It is large under sun and lamps, where a few bright pixels hold most of the noise.
-`principled` shows another material, so it has no error.
+The kinds are untextured and textured. Untextured materials are drawn from the paper's ranges, and no adapter was
+trained on them; their adapters interpolate curves over the viewing angle. Textured materials are those of
+bench/scenes.py; their network runs at every shading point. All results are ratios to `layered`, as geometric means over
+the materials. bench/frames.py defines variance, error and efficiency. The verdict names the BSDF with the higher
+efficiency by error, or "even" if the two efficiencies differ by less than 10 %. `doubt` is the relative standard error
+of the efficiency by error, estimated over the runs. `doubt` is large under sun and lamps, where a few bright pixels
+hold most of the noise. `principled` shows another material, so it has no error.
 
-BSDFs take turns. A vectorised renderer compiles before the clock starts. But it traces every frame in Python again,
-which takes about 0.05 s for the larger network. So adapters look slower in frames that are smaller than these.
+Every run renders one frame with each BSDF. In a vectorised renderer, the measured time excludes the compilation of
+kernels. But the time includes the tracing of the BSDF in Python, about 0.05 s per frame for the larger network. In
+smaller frames than the default, tracing would therefore make the adapters look slower.
 
 Writes settings.json, settings.md (the table) and settings.png (efficiencies by error).
 """
@@ -67,10 +69,10 @@ def main() -> None:
 
 
 def unfinished(arguments: argparse.Namespace) -> Path:
-    """The folder where a run with these settings keeps its measurements until it is complete.
+    """Returns the folder where a run with these settings keeps its measurements until the run is complete.
 
-    A killed run continues from them. The folder's name depends on the scenes' code, so measurements of changed scenes
-    are not used.
+    A killed run continues from the kept measurements. The folder's name depends on the code of the scenes, so
+    measurements are not reused after this code has changed.
     """
     kept = "-".join(
         str(getattr(arguments, name)) for name in ("size", "spp", "runs", "reference_spp", "rr_depth")
@@ -93,7 +95,7 @@ def parse() -> argparse.Namespace:
 
 
 def subjects(kind: str, arguments: argparse.Namespace) -> Iterator[scenes.Subject]:
-    """Yields the materials of one kind, "untextured" or "textured"."""
+    """Yields the materials of one kind: "untextured" or "textured"."""
     if kind == "untextured":
         yield from scenes.unseen(arguments.materials)
     else:
@@ -101,7 +103,7 @@ def subjects(kind: str, arguments: argparse.Namespace) -> Iterator[scenes.Subjec
 
 
 def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
-    """The BSDFs that are compared, by name."""
+    """Returns the BSDFs to compare, by name."""
     found = {scenes.SIMULATION: scenes.simulation(subject)}
     for name in reversed(nma.shipped()):
         make = scenes.network if subject.textures else scenes.adapter
@@ -127,7 +129,7 @@ def compare(
 def summary(
     place: dict[str, str], measured: list[dict[str, dict[str, float | None]]]
 ) -> list[dict[str, Any]]:
-    """The table's rows for one setting: one for each BSDF except the simulation."""
+    """Returns the table's rows for one setting: one row for each BSDF except the simulation."""
     means = frames.mean_ratios(measured, scenes.SIMULATION)
     rows = []
     for name, figures in means.items():
@@ -139,7 +141,7 @@ def summary(
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draws the efficiency by error of every adapter in every setting as bars, one panel for each renderer."""
+    """Draws a bar for the efficiency by error of every adapter in every setting, with one panel for each renderer."""
     renderers = list(dict.fromkeys(row["renderer"] for row in rows))
     names = [name for name in dict.fromkeys(row["BSDF"] for row in rows) if name != scenes.STAND_IN]
     figure = Figure(figsize=(9.5, 0.6 + 3.0 * len(renderers)), layout="constrained")
@@ -150,7 +152,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             gains = [row["efficiency by error"] or np.nan for row in own if row["BSDF"] == name]
             width = 0.8 / len(names)
             middles = np.arange(len(places)) + (n - 0.5 * (len(names) - 1)) * width
-            # Bars begin at 1: there, adapter and simulation are equally efficient.
+            # Bars begin at 1, where adapter and simulation are equally efficient.
             bars = axes.bar(middles, np.array(gains) - 1.0, width, bottom=1.0, label=name)
             axes.bar_label(bars, [f"{gain:.2f}" for gain in gains], fontsize="small", padding=1)
         axes.axhline(1.0, color="k", linewidth=0.8)

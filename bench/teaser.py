@@ -3,10 +3,11 @@
 python -m bench.teaser [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3] [--reference-spp 2048]
     [--adapter layered3-5x64] [--rr-depth 5] [--quick] [--output out/bench]
 
-The scene has three shader balls. Their parameters come from textures, so the network runs at every shading point. A
-table below the pictures shows the median time of a frame, its variance, its squared error and SMAPE against the
-converged picture, and the efficiencies relative to the simulation's. bench/frames.py defines these figures. The parts
-of the converged picture are kept in out/bench/references, so a killed run continues where it stopped.
+The scene has three shader balls. The parameters of their materials come from textures, so the network runs at every
+shading point. A table below the pictures shows, for simulation and adapter, the median time of a frame, the variance,
+the squared error and the SMAPE against the converged picture. Its last row shows the adapter's values and efficiencies
+relative to the simulation. bench/frames.py defines variance, squared error and efficiency. The parts of the converged
+picture are kept in out/bench/references, so a killed run continues where it stopped.
 
 Writes teaser.json and teaser.png.
 """
@@ -29,7 +30,8 @@ from nma.render.load import DEFAULT_ADAPTER
 
 ENLARGED = 4
 Figures = Mapping[str, Mapping[str, Any]]
-# The parts of the picture that are enlarged: a name, and the upper left corner as fractions of width and height.
+# The parts of the picture to enlarge. For each part: its name, and its upper left corner as fractions of width and
+# height.
 CROPS = {"Silver": (0.02, 0.30), "Copper": (0.36, 0.36), "Gold": (0.68, 0.36)}
 
 
@@ -75,7 +77,7 @@ def sheet(
     arguments: argparse.Namespace,
     path: Path,
 ) -> None:
-    """Writes the pictures side by side, with enlarged parts of them and a table."""
+    """Writes a picture file with the pictures side by side, enlarged parts of the pictures, and a table."""
     under = ["", *("{seconds:.2f} s, squared error {error:.2e}".format(**row) for row in rows.values())]
     lines = [Row("", pictures, under)]
     lines += [Row(name, [enlarge(picture, corner) for picture in pictures]) for name, corner in CROPS.items()]
@@ -86,7 +88,7 @@ def sheet(
 
 
 def table(rows: Figures, ratios: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The table below the pictures: the figures of both BSDFs, and the ratios of the adapter to the simulation."""
+    """Returns the table below the pictures: the results of both BSDFs, and the adapter's ratios to the simulation."""
     headings = ("", "time", "variance", "squared error", "SMAPE", "efficiency by variance", "by error")
     keys = ("time", "variance", "error", "smape", "efficiency by variance", "efficiency by error")
     shapes = ("{:.2f} s", "{:.2e}", "{:.2e}", "{:.3f}")
@@ -100,7 +102,7 @@ def table(rows: Figures, ratios: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def enlarge(picture: NDArray, corner: tuple[float, float]) -> NDArray:
-    """Enlarges a part of the picture to the size of the picture; every pixel becomes a block."""
+    """Enlarges a part of the picture to the size of the whole picture; every pixel of the part becomes a block."""
     height, width = picture.shape[:2]
     tall, wide = -(-height // ENLARGED), -(-width // ENLARGED)
     top, left = min(int(corner[1] * height), height - tall), min(int(corner[0] * width), width - wide)

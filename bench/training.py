@@ -1,4 +1,4 @@
-"""Bins per second of a training step, for our recipe and the paper's, and the time of each stage of a step.
+"""Training speed in bins per second, and the time of each stage of a training step, for our and the paper's recipe.
 
 python -m bench.training [--steps 300]
 
@@ -9,7 +9,7 @@ network  the network and its derivatives
 target   the target and its derivatives at the points of the bins, and Adam
 albedo   the term of the directional albedo
 
-The times of the last two are differences between times of whole steps.
+The times of `target` and `albedo` are computed from the times of whole steps with and without these stages.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def measure(pool: Pool, name: str, network: str, steps: int) -> str:
-    """Trains a preset on a small pool, and returns one line of the table, in milliseconds per step."""
+    """Trains with the preset `name` on a small pool, and returns one line of the table. Times are in ms per step."""
     recipe = preset(name, steps=steps, network=network)
     sampler = BinSampler(recipe.bins_law)
     began = time.perf_counter()
@@ -61,7 +61,7 @@ def measure(pool: Pool, name: str, network: str, steps: int) -> str:
 
 
 def seconds(recipe: Recipe, batches: list[Batch]) -> tuple[float, float]:
-    """Milliseconds of a whole step: wall time, and processor time of all cores."""
+    """Returns the milliseconds of a whole step: wall time, and processor time summed over all cores."""
     clock: list[tuple[float, float]] = []
     run = loop.start(recipe, initial_layers(recipe, nma.LAYERED3))
     loop.train(
@@ -70,13 +70,13 @@ def seconds(recipe: Recipe, batches: list[Batch]) -> tuple[float, float]:
         batches.__getitem__,
         progress=lambda _: clock.append((time.perf_counter(), time.process_time())),
     )
-    # The first group of steps compiles, so it is not counted.
+    # The time of the first group of steps contains compilation, so this group is not counted.
     wall, cpu = (np.array(clock[-1]) - np.array(clock[0])) / (recipe.steps - loop.GROUP)
     return 1e3 * wall, 1e3 * cpu
 
 
 def network_seconds(recipe: Recipe, batch: Batch, repeats: int = 200) -> float:
-    """Milliseconds that the network takes for a batch, forward and backward."""
+    """Returns the milliseconds of a forward and backward pass of the network for a batch."""
     layers = initial_layers(recipe, nma.LAYERED3)
     passes = jax.jit(jax.grad(lambda layers: (network_outputs(layers, batch, recipe) ** 2).sum()))
     jax.block_until_ready(passes(layers))
