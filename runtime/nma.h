@@ -121,7 +121,8 @@ public:
                 made.in_plane_ = in_plane_;
                 kernels().decode(preparation_, outputs + q * network_.output_stride(), wi[first + q].z, made.blend_);
             }
-            for (int q = first; q < first + now; ++q) kernels().odds(preparation_, wi[q].z, brdfs[q].blend_);
+            for (int q = first; q < first + now; ++q)
+                kernels().set_lobe_probabilities(preparation_, wi[q].z, brdfs[q].blend_);
         }
     }
     void prepare_many(int count, const float* parameters, const float* cos_theta_i, Brdf* brdfs) const {
@@ -165,12 +166,12 @@ private:
     // The order matters: each step reads what the steps before it wrote.
     Adapter(Weights weights, const Options& options) : weights_(std::move(weights)) {
         // The counts of inputs and outputs that the description asks for.
-        for (const TargetParam& p : weights_.target) add_fields(p);
+        for (const TargetParam& p : weights_.target) add_places(p);
         for (std::size_t k = 0; k < weights_.parameters.size(); ++k)
             owners_.insert(owners_.end(), weights_.parameters[k].size, k);
         preparation_.encoding = Encoding(weights_);
         preparation_.instances = weights_.instances;
-        preparation_.outputs = static_cast<int>(fields_.size()) * weights_.instances + weights_.instances - 1;
+        preparation_.outputs = static_cast<int>(places_.size()) * weights_.instances + weights_.instances - 1;
         preparation_.bounded = weights_.bounded;
         // `check_description` compares these counts with the layers, so it needs the layers as the file has them.
         check_description();
@@ -196,10 +197,10 @@ private:
 
     // Appends the places of a target parameter's numbers. A place is an index in `Principled`, seen as an array of
     // numbers.
-    void add_fields(const TargetParam& p) {
+    void add_places(const TargetParam& p) {
         in_plane_ |= p.in_plane;
         const int first = static_cast<int>(detail::field(p.name, p.size).first);
-        for (int c = 0; c < p.size; ++c) fields_.push_back(first + c);
+        for (int c = 0; c < p.size; ++c) places_.push_back(first + c);
     }
 
     // Throws if the network does not fit its description, or if this version cannot evaluate its target.
@@ -239,16 +240,17 @@ private:
         std::fill(slope + next, slope + output_count(), 1.0f);
     }
 
-    // Fills in `Preparation::lanes`. Fields that the network does not set, and lanes without an instance, get the index
-    // of the first output of padding. It exists because `Network` pads the last layer by at least one neuron, and its
-    // decoded value is 0 because its weights and its range are 0.
+    // Fills in `Preparation::outputs_of_lanes`. Fields that the network does not set, and lanes without an instance,
+    // get the index of the first output of padding. It exists because `Network` pads the last layer by at least one
+    // neuron, and its decoded value is 0 because its weights and its range are 0.
     void lay_out_lanes() {
-        const int size = static_cast<int>(fields_.size()), per_pack = Blend<float>::FIELDS * LANES;
+        const int size = static_cast<int>(places_.size()), per_pack = Blend<float>::PRINCIPLED_SIZE * LANES;
         const int zero = output_count();
-        lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, zero);
+        outputs_of_lanes_.assign(static_cast<std::size_t>(per_pack) * MAX_PACKS, zero);
         for (int k = 0; k < weights_.instances; ++k)
-            for (int f = 0; f < size; ++f) lanes_[k / LANES * per_pack + fields_[f] * LANES + k % LANES] = k * size + f;
-        preparation_.lanes = lanes_.data();
+            for (int f = 0; f < size; ++f)
+                outputs_of_lanes_[k / LANES * per_pack + places_[f] * LANES + k % LANES] = k * size + f;
+        preparation_.outputs_of_lanes = outputs_of_lanes_.data();
     }
 
     // A direction with this cosine. Isotropic adapters read only z, so x is not worth a square root for them.
@@ -284,9 +286,9 @@ private:
     Weights weights_;
     Network network_;
     Preparation preparation_{};
-    std::vector<int> fields_;          // for each number of an instance: its place in `Principled`
-    std::vector<int> lanes_;           // `Preparation::lanes`
-    std::vector<std::size_t> owners_;  // for each number of the parameters: the index of its parameter
+    std::vector<int> places_;            // for each number of an instance: its place in `Principled`
+    std::vector<int> outputs_of_lanes_;  // `Preparation::outputs_of_lanes`
+    std::vector<std::size_t> owners_;    // for each number of the parameters: the index of its parameter
     std::unique_ptr<float[], detail::FreeAligned> ranges_;
     bool in_plane_ = false;
 };
@@ -311,7 +313,7 @@ public:
     }
 
     // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of both nodes sum to 1, so the
-    // interpolated weights do. The same holds for the odds.
+    // interpolated weights do. The same holds for the lobe probabilities.
     Brdf at(float cos_theta_i) const {
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
@@ -323,9 +325,9 @@ public:
         made.blend_.count = a.count;
         made.blend_.scale = a.scale + (b.scale - a.scale) * t[0];
         for (int n = 0; n < a.used(); ++n) {
-            const Lanes<float>* from = a.packs[n].lanes();
-            const Lanes<float>* to = b.packs[n].lanes();
-            Lanes<float>* between = made.blend_.packs[n].lanes();
+            const Lanes<float>* from = a.packs[n].as_array();
+            const Lanes<float>* to = b.packs[n].as_array();
+            Lanes<float>* between = made.blend_.packs[n].as_array();
             for (std::size_t k = 0; k < sizeof(Pack<float>) / sizeof(Lanes<float>); ++k)
                 between[k] = lerp(from[k], to[k], t);
         }

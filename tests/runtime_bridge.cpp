@@ -5,7 +5,7 @@
 
 namespace {
 
-constexpr int FIELDS = nma::Blend<float>::FIELDS;
+constexpr int PRINCIPLED_SIZE = nma::Blend<float>::PRINCIPLED_SIZE;
 
 // Makes a blend from an array: the fields of the first instance in the order of `Principled`, the fields of the second
 // instance, and so on, and then the weights of all instances.
@@ -14,17 +14,17 @@ nma::Blend<T> blend_of(const T* numbers, int count) {
     nma::Blend<T> made(count);
     for (int k = 0; k < count; ++k) {
         nma::Principled<T> instance;
-        std::memcpy(&instance, numbers + FIELDS * k, sizeof(instance));
-        made.set(k, instance, numbers[FIELDS * count + k]);
+        std::memcpy(&instance, numbers + PRINCIPLED_SIZE * k, sizeof(instance));
+        made.set(k, instance, numbers[PRINCIPLED_SIZE * count + k]);
     }
     return made;
 }
 
 template <class T>
 void evaluate(int n, int count, bool bounded, const T* blends, const T* wi, const T* wo, T* out) {
-    for (int i = 0; i < n; ++i, blends += (FIELDS + 1) * count, wi += 3, wo += 3, out += 4) {
+    for (int i = 0; i < n; ++i, blends += (PRINCIPLED_SIZE + 1) * count, wi += 3, wo += 3, out += 4) {
         nma::Blend<T> blend = blend_of(blends, count);
-        nma::weigh(blend, wi[2], bounded);
+        nma::set_lobe_probabilities(blend, wi[2], bounded);
         const auto e = nma::eval_pdf<T>(blend, {wi[0], wi[1], wi[2]}, {wo[0], wo[1], wo[2]});
         const T row[] = {e.value.x, e.value.y, e.value.z, e.pdf};
         std::copy_n(row, 4, out);
@@ -46,9 +46,9 @@ void evaluate_double(int n, int count, bool bounded, const double* blends, const
 
 // Writes rows of seven numbers: wo, value and pdf.
 void sample_double(int n, int count, const double* blends, const double* wi, const double* u, double* out) {
-    for (int i = 0; i < n; ++i, blends += (FIELDS + 1) * count, wi += 3, u += 3, out += 7) {
+    for (int i = 0; i < n; ++i, blends += (PRINCIPLED_SIZE + 1) * count, wi += 3, u += 3, out += 7) {
         nma::Blend<double> blend = blend_of(blends, count);
-        nma::weigh(blend, wi[2], false);
+        nma::set_lobe_probabilities(blend, wi[2], false);
         const auto s = nma::sample<double>(blend, {wi[0], wi[1], wi[2]}, u[0], u[1], u[2]);
         const double row[] = {s.wo.x, s.wo.y, s.wo.z, s.value.x, s.value.y, s.value.z, s.pdf};
         std::copy_n(row, 7, out);
@@ -57,12 +57,12 @@ void sample_double(int n, int count, const double* blends, const double* wi, con
 
 // Writes the blends of n BRDFs that the C interface made: the fields of all instances, and then their weights.
 void brdf_numbers(int n, int count, const nma_brdf* brdfs, float* out) {
-    for (int i = 0; i < n; ++i, out += (FIELDS + 1) * count) {
+    for (int i = 0; i < n; ++i, out += (PRINCIPLED_SIZE + 1) * count) {
         const nma::Blend<float>& blend = reinterpret_cast<const nma::Brdf*>(brdfs + i)->blend();
         for (int k = 0; k < count; ++k) {
             const nma::Principled<float> instance = blend.instance(k);
-            std::memcpy(out + FIELDS * k, &instance, sizeof(instance));
-            out[FIELDS * count + k] = blend.weight(k);
+            std::memcpy(out + PRINCIPLED_SIZE * k, &instance, sizeof(instance));
+            out[PRINCIPLED_SIZE * count + k] = blend.weight(k);
         }
     }
 }

@@ -18,7 +18,7 @@ from nma.params import MEASURED
 
 CASES = 4000
 # The count of numbers per instance. Its colour is one field of three numbers.
-FIELDS = len(target.Principled._fields) + 2
+PRINCIPLED_SIZE = len(target.Principled._fields) + 2
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -73,9 +73,9 @@ def unflat(columns):
     """Inverts `flat`: makes a blend of two instances from its columns."""
     instances = []
     for k in range(2):
-        p = columns[FIELDS * k : FIELDS * (k + 1)]
+        p = columns[PRINCIPLED_SIZE * k : PRINCIPLED_SIZE * (k + 1)]
         instances.append(target.Principled(Vec3(*p[:3]), *p[3:]))
-    return target.Blend(tuple(instances), tuple(columns[2 * FIELDS :]))
+    return target.Blend(tuple(instances), tuple(columns[2 * PRINCIPLED_SIZE :]))
 
 
 def test_samples_are_those_of_the_target(bridge):

@@ -1,4 +1,4 @@
-"""Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and tests of the odds of the lobes.
+"""Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and tests of the lobe probabilities.
 
 The tests compute in double precision. At grazing angles the narrowest lobes are 1e-5 wide. Rounding to single precision
 moves samples between such narrow bins. Tests in test_target.py show that both precisions draw the same directions.
@@ -252,7 +252,7 @@ def test_samples_with_alpha_off_by_five_per_cent_are_rejected(bins):
     assert np.mean(p < SIDAK) > 0.5
 
 
-def test_odds_follow_the_albedos():
+def test_lobe_probabilities_follow_the_albedos():
     """Each lobe is chosen about as often as its share of the albedo, so that sample weights vary little.
 
     A failure means that the estimates of the lobes' albedos are poor, and renderings become noisier.
@@ -267,7 +267,7 @@ def test_odds_follow_the_albedos():
     deviation = weight.std(1) / weight.mean(1)
     assert np.median(deviation) < 0.2
     assert deviation.max() < 0.7
-    total = sum(sum(odds) for odds in lobe_probabilities(cases.blend, cases.wi.z))
+    total = sum(sum(p) for p in lobe_probabilities(cases.blend, cases.wi.z))
     np.testing.assert_allclose(total, 1.0, rtol=1e-5)
 
 

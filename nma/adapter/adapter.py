@@ -190,8 +190,8 @@ class Adapter:
         if ops.backend(*columns, wi.z) == "drjit":
             raw = network.forward_lanes(self.layers, inputs, active)
         else:
-            lanes = np.broadcast_arrays(wi.z, *inputs)[1:]
-            raw = list(network.forward(self.layers, np.stack(lanes, axis=-1).astype(np.float32)).T)
+            arrays = np.broadcast_arrays(wi.z, *inputs)[1:]
+            raw = list(network.forward(self.layers, np.stack(arrays, axis=-1).astype(np.float32)).T)
         return self.decode(raw, wi)
 
     def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
@@ -216,8 +216,8 @@ class Adapter:
         mu = np.asarray(cos_theta_i, np.float64)
         columns = [np.repeat(c, len(mu)) for c in p.T]
         flat = numbers(self.prepare(columns, ops.at_azimuth_0(np.tile(mu, len(p)))).blend, self.target)
-        lanes = np.broadcast_arrays(*flat)
-        return np.stack(lanes, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
+        arrays = np.broadcast_arrays(*flat)
+        return np.stack(arrays, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
 
     def check_isotropic(self) -> None:
         """Raises `ParamError` if the adapter needs more of the view direction than cos(theta_i)."""

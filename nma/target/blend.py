@@ -30,7 +30,7 @@ class Blend(NamedTuple):
     scale: Color = Color(1.0, 1.0, 1.0)
 
 
-class Odds(NamedTuple):
+class LobeProbabilities(NamedTuple):
     """The probability of sampling each lobe of an instance."""
 
     diffuse: Float
@@ -56,15 +56,15 @@ def eval_pdf(blend: Blend, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
     g = geometry(wi, wo)
     value = Color(0.0, 0.0, 0.0)
     pdf: Float = 0.0
-    for p, weight, odds in zip(
+    for p, weight, probability in zip(
         blend.instances, blend.weights, lobe_probabilities(blend, g.wi.z), strict=True
     ):
         lobes = eval_pdf_lobes(p, g)
         value = value + lobes.value * weight
         pdf = pdf + (
-            odds.diffuse * lobes.diffuse_pdf
-            + odds.spec * lobes.spec_pdf
-            + odds.clearcoat * lobes.clearcoat_pdf
+            probability.diffuse * lobes.diffuse_pdf
+            + probability.spec * lobes.spec_pdf
+            + probability.clearcoat * lobes.clearcoat_pdf
         )
     return ops.select(g.valid, value * blend.scale, 0.0), ops.select(g.valid, pdf, 0.0)
 
@@ -86,17 +86,17 @@ def pdf(blend: Blend, wi: Vec3, wo: Vec3) -> Float:
 def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
     """A direction `wo` from three uniform numbers in [0, 1), its value, and its density (0 for an invalid sample)."""
     view = Vec3(wi.x, wi.y, ops.select(wi.z > MIN_COS, wi.z, 1.0))
-    odds = lobe_probabilities(blend, view.z)
+    probabilities = lobe_probabilities(blend, view.z)
     # All diffuse lobes come first, then all specular ones, then the clearcoats.
-    spec_start = sum(o.diffuse for o in odds)
-    clearcoat_start = spec_start + sum(o.spec for o in odds)
+    spec_start = sum(p.diffuse for p in probabilities)
+    clearcoat_start = spec_start + sum(p.spec for p in probabilities)
     (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)
     spec_end = spec_start
     clearcoat_end = clearcoat_start
     # Select the widths of the instance whose interval of `u_lobe` is hit: its interval follows the previous instance's.
-    for o, (next_x, next_y, next_c) in zip(odds, others, strict=False):
-        spec_end = spec_end + o.spec
-        clearcoat_end = clearcoat_end + o.clearcoat
+    for p, (next_x, next_y, next_c) in zip(probabilities, others, strict=False):
+        spec_end = spec_end + p.spec
+        clearcoat_end = clearcoat_end + p.clearcoat
         alpha_x = ops.select(u_lobe >= spec_end, next_x, alpha_x)
         alpha_y = ops.select(u_lobe >= spec_end, next_y, alpha_y)
         alpha_c = ops.select(u_lobe >= clearcoat_end, next_c, alpha_c)
@@ -110,13 +110,16 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
     return wo, value, density
 
 
-def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[Odds, ...]:
+def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[LobeProbabilities, ...]:
     """The probability of each lobe of each instance, in proportion to its bound of albedo; all of them sum to one."""
     albedos = [lobe_albedos(p, cos_theta_i) for p in blend.instances]
-    means = [Odds(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat) for a in albedos]
+    means = [LobeProbabilities(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat) for a in albedos]
     total = sum(w * (m.diffuse + m.spec + m.clearcoat) for w, m in zip(blend.weights, means, strict=True))
     shares = [w / total for w in blend.weights]
-    return tuple(Odds(s * m.diffuse, s * m.spec, s * m.clearcoat) for s, m in zip(shares, means, strict=True))
+    return tuple(
+        LobeProbabilities(s * m.diffuse, s * m.spec, s * m.clearcoat)
+        for s, m in zip(shares, means, strict=True)
+    )
 
 
 def lobe_alphas(blend: Blend) -> tuple[tuple[Float, Float, Float], ...]:

@@ -11,26 +11,26 @@ namespace nma {
 
 constexpr int MAX_PACKS = 2, MAX_INSTANCES = MAX_PACKS * LANES;
 
-// The odds of a sample: the probability that it is drawn from each lobe of an instance.
+// The probability that a sample is drawn from each lobe of an instance.
 template <class T>
-struct Odds {
+struct LobeProbabilities {
     T diffuse, spec, clearcoat;
 };
 
-// Four instances side by side, with their weights and their odds. A lane without an instance holds zeros.
+// Four instances side by side, with their weights and their lobe probabilities. A lane without an instance holds zeros.
 template <class T>
 struct Pack {
     Principled<Lanes<T>> instances;
     Lanes<T> weights;
-    Odds<Lanes<T>> odds;
+    LobeProbabilities<Lanes<T>> probabilities;
 
     // All numbers of the pack as an array, in the order above: first the fields of the instances.
-    Lanes<T>* lanes() { return reinterpret_cast<Lanes<T>*>(this); }
-    const Lanes<T>* lanes() const { return reinterpret_cast<const Lanes<T>*>(this); }
+    Lanes<T>* as_array() { return reinterpret_cast<Lanes<T>*>(this); }
+    const Lanes<T>* as_array() const { return reinterpret_cast<const Lanes<T>*>(this); }
 };
 
-// Instances and their weights, which sum to 1. `weigh` fills in the odds. It also fills in `scale`, the factor of the
-// blend's value in each colour channel.
+// Instances and their weights, which sum to 1. `set_lobe_probabilities` fills in the lobe probabilities. It also fills
+// in `scale`, the factor of the blend's value in each colour channel.
 template <class T>
 struct Blend {
     int count = 0;
@@ -44,23 +44,23 @@ struct Blend {
     int used() const { return (count + LANES - 1) / LANES; }
 
     void set(int k, const Principled<T>& instance, T weight) {
-        static_assert(sizeof(Principled<Lanes<T>>) == FIELDS * sizeof(Lanes<T>));
+        static_assert(sizeof(Principled<Lanes<T>>) == PRINCIPLED_SIZE * sizeof(Lanes<T>));
         Pack<T>& pack = packs[k / LANES];
         const auto* from = reinterpret_cast<const T*>(&instance);
-        for (int f = 0; f < FIELDS; ++f) pack.lanes()[f].set(k % LANES, from[f]);
+        for (int f = 0; f < PRINCIPLED_SIZE; ++f) pack.as_array()[f].set(k % LANES, from[f]);
         pack.weights.set(k % LANES, weight);
     }
     Principled<T> instance(int k) const {
         Principled<T> found;
-        const Lanes<T>* from = packs[k / LANES].lanes();
+        const Lanes<T>* from = packs[k / LANES].as_array();
         auto* to = reinterpret_cast<T*>(&found);
-        for (int f = 0; f < FIELDS; ++f) to[f] = from[f][k % LANES];
+        for (int f = 0; f < PRINCIPLED_SIZE; ++f) to[f] = from[f][k % LANES];
         return found;
     }
     T weight(int k) const { return packs[k / LANES].weights[k % LANES]; }
 
     // The count of numbers that describe an instance.
-    static constexpr int FIELDS = sizeof(Principled<T>) / sizeof(T);
+    static constexpr int PRINCIPLED_SIZE = sizeof(Principled<T>) / sizeof(T);
 };
 
 // The value f cos(theta_o) [1/sr] of a pair of directions, and the density with which `sample` draws `wo` [1/sr].
@@ -78,26 +78,26 @@ struct Sample {
     T pdf;
 };
 
-// Fills in the odds of the blend's lobes at cos(theta_i), which follow the estimated albedos of the lobes. If
-// `bounded`, also fills in `scale`, so that the blend reflects no more light than it receives.
+// Fills in the lobe probabilities at cos(theta_i), which follow the estimated albedos of the lobes. If `bounded`, also
+// fills in `scale`, so that the blend reflects no more light than it receives.
 template <class T>
-inline void weigh(Blend<T>& blend, T cos_theta_i, bool bounded) {
+inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded) {
     const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
     // Lanes 0 to 2 hold the albedo of the blend in red, green and blue. Lane 3 holds their sum, which is three times
-    // the sum of all odds before they are normalised.
+    // the sum of all probabilities before they are normalised.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
         const Albedos<Lanes<T>> a = lobe_albedos<Lanes<T>>(pack.instances, cosine);
         const Lanes<T> w = pack.weights;
-        pack.odds = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
+        pack.probabilities = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
         const Vec3<Lanes<T>> albedo = (a.diffuse + a.clearcoat + a.spec) * w;
         sum += sums(albedo.x, albedo.y, albedo.z, albedo.x + albedo.y + albedo.z);
     }
     const Lanes<T> inverse = Lanes<T>(T(1), T(1), T(1), T(3)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0)));
     const Lanes<T> share = inverse[3];
     for (int n = 0; n < blend.used(); ++n) {
-        Odds<Lanes<T>>& o = blend.packs[n].odds;
+        LobeProbabilities<Lanes<T>>& o = blend.packs[n].probabilities;
         o = {o.diffuse * share, o.spec * share, o.clearcoat * share};
     }
     if (bounded) blend.scale = {inverse[0], inverse[1], inverse[2]};
@@ -121,20 +121,20 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
         const Pack<T>& pack = blend.packs[n];
         const Lobes<Lanes<T>> lobes = eval_pdf_lobes<Lanes<T>>(pack.instances, wide);
         result.value = result.value + sum(lobes.value * pack.weights);
-        result.pdf += sum(pack.odds.diffuse * lobes.diffuse_pdf + pack.odds.spec * lobes.spec_pdf +
-                          pack.odds.clearcoat * lobes.clearcoat_pdf);
+        result.pdf += sum(pack.probabilities.diffuse * lobes.diffuse_pdf + pack.probabilities.spec * lobes.spec_pdf +
+                          pack.probabilities.clearcoat * lobes.clearcoat_pdf);
     }
     result.value = result.value * blend.scale;
     return result;
 }
 
-// The index of the instance that `u` chooses. From `start` on, each instance has an interval as long as the odds of its
-// `lobe`, and `u` lies in the interval of the chosen one. Moves `start` to the end of that interval. Returns `count` if
-// `u` lies beyond all intervals.
+// The index of the instance that `u` chooses. From `start` on, each instance has an interval as long as the probability
+// of its `lobe`, and `u` lies in the interval of the chosen one. Moves `start` to the end of that interval. Returns
+// `count` if `u` lies beyond all intervals.
 template <class T>
-inline int chosen(const Blend<T>& blend, Lanes<T> Odds<Lanes<T>>::* lobe, T u, T& start) {
+inline int chosen(const Blend<T>& blend, Lanes<T> LobeProbabilities<Lanes<T>>::* lobe, T u, T& start) {
     int k = 0;
-    while (k < blend.count && u >= (start += (blend.packs[k / LANES].odds.*lobe)[k % LANES])) ++k;
+    while (k < blend.count && u >= (start += (blend.packs[k / LANES].probabilities.*lobe)[k % LANES])) ++k;
     return k;
 }
 
@@ -144,16 +144,16 @@ inline Sample<T> sample(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1
     if (!(wi.z > MIN_COS<T>)) return {{T(0), T(0), T(1)}, {T(0), T(0), T(0)}, T(0)};
     // In the order of `u_lobe`, all diffuse lobes come first, then all specular lobes, then all clearcoats.
     T end = T(0);
-    for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].odds.diffuse);
+    for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].probabilities.diffuse);
     Vec3<T> wo;
     if (u_lobe < end) {
         wo = sample_diffuse<T>(u1, u2);
-    } else if (int k = chosen(blend, &Odds<Lanes<T>>::spec, u_lobe, end); k < blend.count) {
+    } else if (int k = chosen(blend, &LobeProbabilities<Lanes<T>>::spec, u_lobe, end); k < blend.count) {
         const Principled<Lanes<T>>& p = blend.packs[k / LANES].instances;
         const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness[k % LANES], p.anisotropic[k % LANES]);
         wo = sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
     } else {
-        k = std::min(chosen(blend, &Odds<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);
+        k = std::min(chosen(blend, &LobeProbabilities<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);
         const T gloss = blend.packs[k / LANES].instances.clearcoat_gloss[k % LANES];
         wo = sample_clearcoat<T>(wi, clearcoat_alpha<T>(gloss), u1, u2);
     }

@@ -101,13 +101,13 @@ struct Kernels {
     // Runs the network for many queries, a row each.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
-    // `encode` fills in a row of inputs. `decode` makes a blend of a row of outputs `raw`, which it overwrites. `odds`
-    // then fills in the odds of the blend. `odds` is apart from `decode` because its vectors are narrow. Some CPUs
-    // have fewer units for their widest vectors, and run narrow vectors among wide ones at half the speed. So batches
-    // call `decode` for all queries first, and then `odds`.
+    // `encode` fills in a row of inputs. `decode` makes a blend of a row of outputs `raw`, which it overwrites.
+    // `set_lobe_probabilities` then completes the blend. It is apart from `decode` because its vectors are narrow. Some
+    // CPUs have fewer units for their widest vectors, and run narrow vectors among wide ones at half the speed. So
+    // batches call `decode` for all queries first, and then `set_lobe_probabilities`.
     void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
     void (*decode)(const Preparation&, float* raw, float cosine, Blend<float>&);
-    void (*odds)(const Preparation&, float cosine, Blend<float>&);
+    void (*set_lobe_probabilities)(const Preparation&, float cosine, Blend<float>&);
     // All steps for one query.
     void (*prepare)(const Preparation&, const float* parameters, const Vec3<float>& wi, Blend<float>&);
 };
@@ -119,14 +119,19 @@ inline const Kernels& kernels(InstructionSet set) {
                                       portable::forward_many,
                                       portable::encode,
                                       portable::decode,
-                                      portable::odds,
+                                      portable::set_lobe_probabilities,
                                       portable::prepare<portable::forward>};
     if (!supported(set)) return PORTABLE;
 #if defined(NMA_X86)
-    static constexpr Kernels AVX2{InstructionSet::avx2, avx2::forward, avx2::forward_many,          avx2::encode,
-                                  avx2::decode,         avx2::odds,    avx2::prepare<avx2::forward>};
+    static constexpr Kernels AVX2{InstructionSet::avx2,
+                                  avx2::forward,
+                                  avx2::forward_many,
+                                  avx2::encode,
+                                  avx2::decode,
+                                  avx2::set_lobe_probabilities,
+                                  avx2::prepare<avx2::forward>};
     static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_either, avx512::forward_many,
-                                    avx512::encode,         avx512::decode,         avx512::odds,
+                                    avx512::encode,         avx512::decode,         avx512::set_lobe_probabilities,
                                     avx512::prepare_either};
 #if !defined(NMA_NO_AVX512_BF16)
     static constexpr Kernels BF16{InstructionSet::avx512_bf16,
@@ -134,15 +139,20 @@ inline const Kernels& kernels(InstructionSet set) {
                                   avx512_bf16::forward_many,
                                   avx512::encode,
                                   avx512::decode,
-                                  avx512::odds,
+                                  avx512::set_lobe_probabilities,
                                   avx512::prepare<avx512_bf16::forward>};
     if (set == InstructionSet::avx512_bf16) return BF16;
 #endif
     if (set == InstructionSet::avx2) return AVX2;
     if (set == InstructionSet::avx512) return AVX512;
 #elif defined(NMA_ARM)
-    static constexpr Kernels NEON{InstructionSet::neon, neon::forward, neon::forward_many,          neon::encode,
-                                  neon::decode,         neon::odds,    neon::prepare<neon::forward>};
+    static constexpr Kernels NEON{InstructionSet::neon,
+                                  neon::forward,
+                                  neon::forward_many,
+                                  neon::encode,
+                                  neon::decode,
+                                  neon::set_lobe_probabilities,
+                                  neon::prepare<neon::forward>};
     if (set == InstructionSet::neon) return NEON;
 #endif
     return PORTABLE;

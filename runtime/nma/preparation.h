@@ -18,11 +18,11 @@ struct Preparation {
     bool bounded;            // whether the blend must not reflect more light than it receives
     // For each lane of each field of each pack: the index of its number among the decoded outputs. The order is that of
     // `Pack` in memory. A lane without a number has the index of an output of padding, whose value is 0.
-    const int* lanes;
+    const int* outputs_of_lanes;
 };
 
-// Picks the numbers of four lanes from memory, by four indices. LANES is 4 in this file, for every instruction set: it
-// is `nma::LANES`, the count of lanes of `Lanes` and `Pack`. In kernels/, LANES is the count of lanes of a vector.
+// Picks the numbers of four lanes from memory, by four indices. `LANES` is the count of lanes of `Lanes` and `Pack`, 4
+// for every instruction set.
 //
 // `Few` (kernels/avx512.h) is its twin for at most `MOST` numbers, which it picks from registers. The other instruction
 // sets have no such registers. There, `Few` is another name of `Indexed`.
@@ -42,12 +42,13 @@ template <class Pick>
 inline void assemble(const Preparation& preparation, const float* numbers, const Pick& pick, Blend<float>& blend) {
     blend.count = preparation.instances;
     blend.scale = {1.0f, 1.0f, 1.0f};
-    const int* index = preparation.lanes;
+    const int* index = preparation.outputs_of_lanes;
     const float* share = numbers + preparation.outputs - (blend.count - 1);
     float left = 1.0f;
     for (int n = 0; n < blend.used(); ++n) {
         Pack<float>& pack = blend.packs[n];
-        NMA_UNROLL for (int f = 0; f < Blend<float>::FIELDS; ++f, index += LANES) pack.lanes()[f] = pick(index);
+        NMA_UNROLL for (int f = 0; f < Blend<float>::PRINCIPLED_SIZE; ++f, index += LANES) pack.as_array()[f] =
+            pick(index);
         float weights[LANES] = {};
         NMA_UNROLL for (int k = 0; k < LANES; ++k) {
             const int next = n * LANES + k + 1;

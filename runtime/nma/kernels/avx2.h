@@ -11,7 +11,7 @@
 
 namespace nma::avx2 {
 
-constexpr int LANES = 8, SINGLE_TILE = 8, BATCH_TILE = 2, BATCH_QUERIES = 6;
+constexpr int VEC_SIZE = 8, SINGLE_TILE = 8, BATCH_TILE = 2, BATCH_QUERIES = 6;
 
 using Vec = __m256;
 

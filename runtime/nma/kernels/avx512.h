@@ -15,7 +15,7 @@
 
 namespace nma::avx512 {
 
-constexpr int LANES = 16, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 6;
+constexpr int VEC_SIZE = 16, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 6;
 
 using Vec = __m512;
 
@@ -47,13 +47,13 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
 }
 
 // Twin of `Indexed` in preparation.h, for at most 32 numbers: it picks them from two registers instead of memory. A
-// call returns `nma::LANES` numbers, which are 4, and reads as many indices. LANES alone is 16 here.
+// call returns `LANES` numbers, which are 4, and reads as many indices.
 struct Few {
-    static constexpr int MOST = 2 * LANES;
+    static constexpr int MOST = 2 * VEC_SIZE;
     Vec low, high;
 
     NMA_FN Few(Vec a, Vec b) : low(a), high(b) {}
-    NMA_FN explicit Few(const float* all) : Few(load(all), load(all + LANES)) {}
+    NMA_FN explicit Few(const float* all) : Few(load(all), load(all + VEC_SIZE)) {}
     NMA_FN nma::Lanes<float> operator()(const int* index) const {
         const __m512i four = _mm512_castsi128_si512(_mm_loadu_si128(reinterpret_cast<const __m128i*>(index)));
         const __m128 numbers = _mm512_maskz_extractf32x4_ps(0xf, _mm512_permutex2var_ps(low, four, high), 0);
@@ -81,7 +81,7 @@ NMA_OP Vec turn(Vec v) {
 // Adds four inputs to the sums of 16 neurons. `inputs` repeats the four inputs in all blocks. `columns` points to their
 // four columns of `LayerView::turned`. Sum r is still to be turned by r lanes.
 NMA_OP void add_block(Vec (&sums)[4], Vec inputs, const float* columns) {
-    NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * LANES), sums[r]);
+    NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * VEC_SIZE), sums[r]);
 }
 // The neurons: the sums, each turned by its own number of lanes, added up.
 NMA_OP Vec total(const Vec (&sums)[4]) {
@@ -91,9 +91,9 @@ NMA_OP Vec total(const Vec (&sums)[4]) {
 // The first layer, whose inputs lie in memory. Its NARROW neurons fill the two vectors `y`.
 NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
-        const float* column = layer.turned + v * layer.in * LANES;
-        Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
-        for (int i = 0; i < layer.in; i += 4) add_block(sums, repeat(x + i), column + i * LANES);
+        const float* column = layer.turned + v * layer.in * VEC_SIZE;
+        Vec sums[4] = {load(layer.bias + v * VEC_SIZE), set(0.0f), set(0.0f), set(0.0f)};
+        for (int i = 0; i < layer.in; i += 4) add_block(sums, repeat(x + i), column + i * VEC_SIZE);
         y[v] = total(sums);
     }
 }
@@ -103,8 +103,8 @@ NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a),
                           repeat<0>(b), repeat<1>(b), repeat<2>(b), repeat<3>(b)};
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
-        Vec sums[4] = {load(layer.bias + v * LANES), set(0.0f), set(0.0f), set(0.0f)};
-        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.turned + (v * 8 + k) * 4 * LANES);
+        Vec sums[4] = {load(layer.bias + v * VEC_SIZE), set(0.0f), set(0.0f), set(0.0f)};
+        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.turned + (v * 8 + k) * 4 * VEC_SIZE);
         y[v] = total(sums);
     }
 }
@@ -121,7 +121,7 @@ NMA_FN inline void forward_either(const NetworkView& view, const float* inputs, 
     Vec y[2];
     run_narrow(view, inputs, y);
     store(outputs, y[0]);
-    store(outputs + LANES, y[1]);
+    store(outputs + VEC_SIZE, y[1]);
 }
 
 NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, const float* parameters,
@@ -131,11 +131,11 @@ NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, cons
     encode(preparation, parameters, wi, inputs);
     run_narrow(preparation.network, inputs, y);
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
-        y[v] = decoded(preparation.ranges, v * LANES, y[v], 1.0f - wi.z * wi.z);
-        store(numbers + v * LANES, y[v]);
+        y[v] = decoded(preparation.ranges, v * VEC_SIZE, y[v], 1.0f - wi.z * wi.z);
+        store(numbers + v * VEC_SIZE, y[v]);
     }
     assemble(preparation, numbers, Few(y[0], y[1]), blend);
-    weigh(blend, wi.z, preparation.bounded);
+    nma::set_lobe_probabilities(blend, wi.z, preparation.bounded);
 }
 
 // `prepare` for any network, in registers if it is narrow.

@@ -1,7 +1,7 @@
 // x86-64 with AVX512-BF16. Its instruction multiplies two inputs by two weights at once and adds both products. Inputs
 // and activations are rounded to bfloat16, which keeps 8 significant bits; sums are float32. Layers must have `pairs`.
 //
-// Only the network differs from avx512.h. `encode`, `decode` and `odds` are shared with it.
+// Only the network differs from avx512.h. `encode`, `decode` and `set_lobe_probabilities` are shared with it.
 #pragma once
 
 #include <cstring>
@@ -13,8 +13,8 @@
 
 namespace nma::avx512_bf16 {
 
-using avx512::LANES;
 using avx512::Vec;
+using avx512::VEC_SIZE;
 
 // Computes VECTORS vectors of neurons, the first of which is neuron `first`, for QUERIES queries. `x` holds the inputs
 // in pairs. Twin of `tile` in body.inl.
@@ -23,14 +23,14 @@ NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* 
                         int y_stride) {
     Vec sums[SUMS][QUERIES][VECTORS];
     NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
-        sums[0][q][v] = _mm512_load_ps(layer.bias + first + v * LANES);
+        sums[0][q][v] = _mm512_load_ps(layer.bias + first + v * VEC_SIZE);
         NMA_UNROLL for (int s = 1; s < SUMS; ++s) sums[s][q][v] = _mm512_setzero_ps();
     }
     const std::uint32_t* pair = layer.pairs + first;
     for (int i = 0; i < layer.in / 2; i += 2) {
         NMA_UNROLL for (int k = 0; k < 2; ++k) {
             __m512i weights[VECTORS];
-            NMA_UNROLL for (int v = 0; v < VECTORS; ++v) weights[v] = _mm512_load_si512(pair + v * LANES);
+            NMA_UNROLL for (int v = 0; v < VECTORS; ++v) weights[v] = _mm512_load_si512(pair + v * VEC_SIZE);
             NMA_UNROLL for (int q = 0; q < QUERIES; ++q) {
                 const __m512i input = _mm512_set1_epi32(static_cast<int>(x[q * x_stride + i + k]));
                 NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
@@ -44,7 +44,7 @@ NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* 
     NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
         Vec sum = sums[0][q][v];
         NMA_UNROLL for (int s = 1; s < SUMS; ++s) sum = _mm512_add_ps(sum, sums[s][q][v]);
-        _mm512_store_ps(y + q * y_stride + first + v * LANES, sum);
+        _mm512_store_ps(y + q * y_stride + first + v * VEC_SIZE, sum);
     }
 }
 
@@ -52,7 +52,7 @@ template <int VECTORS, int QUERIES>
 NMA_FN inline void tiles(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y,
                          int y_stride) {
     constexpr int SUMS = QUERIES > 1 ? 1 : 2;
-    for (; first + VECTORS * LANES <= layer.width; first += VECTORS * LANES)
+    for (; first + VECTORS * VEC_SIZE <= layer.width; first += VECTORS * VEC_SIZE)
         tile<VECTORS, QUERIES, SUMS>(layer, first, x, x_stride, y, y_stride);
     if constexpr (VECTORS > 1)
         if (first < layer.width) tiles<VECTORS / 2, QUERIES>(layer, first, x, x_stride, y, y_stride);
@@ -70,9 +70,9 @@ NMA_FN inline void run_layers(const NetworkView& view, const float* inputs, int 
     alignas(64) std::uint32_t x[QUERIES * WIDEST_LAYER / 2];
     constexpr int STRIDE = WIDEST_LAYER / 2;
     for (int q = 0; q < QUERIES; ++q)
-        for (int i = 0; i < view.layers[0].in; i += LANES) {
+        for (int i = 0; i < view.layers[0].in; i += VEC_SIZE) {
             const int left = view.layers[0].in - i;
-            const __mmask16 present = static_cast<__mmask16>(left >= LANES ? 0xffff : (1 << left) - 1);
+            const __mmask16 present = static_cast<__mmask16>(left >= VEC_SIZE ? 0xffff : (1 << left) - 1);
             store_pairs(x + q * STRIDE + i / 2, _mm512_maskz_loadu_ps(present, inputs + q * input_stride + i));
         }
     for (int k = 0; k < view.depth; ++k) {
@@ -80,7 +80,7 @@ NMA_FN inline void run_layers(const NetworkView& view, const float* inputs, int 
         if (k + 1 == view.depth) return tiles<4, QUERIES>(layer, 0, x, STRIDE, outputs, output_stride);
         tiles<4, QUERIES>(layer, 0, x, STRIDE, y, layer.width);
         for (int q = 0; q < QUERIES; ++q)
-            for (int j = 0; j < layer.width; j += LANES)
+            for (int j = 0; j < layer.width; j += VEC_SIZE)
                 store_pairs(x + q * STRIDE + j / 2,
                             avx512::max(avx512::load(y + q * layer.width + j), avx512::set(0.0f)));
     }

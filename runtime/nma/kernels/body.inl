@@ -4,7 +4,7 @@
 //
 //     NMA_FN        macro: the attributes of a function for this instruction set
 //     NMA_OP        macro: the same attributes, and the function is always inlined
-//     Vec, LANES    the vector type, and its count of floats: 4, 8 or 16. It hides `nma::LANES`, which is 4
+//     Vec, VEC_SIZE the vector type, and its count of floats: 4, 8 or 16
 //     load, store, set, add, sub, mul, max, min
 //     fma           a b + c
 //     inverse       1 / a
@@ -16,8 +16,8 @@
 //     BATCH_QUERIES queries that a tile of a batch has
 //     Few           picks numbers for lanes, from registers if possible: see `Indexed` in preparation.h
 //
-// `forward`, `forward_many`, `encode`, `decode`, `odds` and `prepare` are the kernels. `Kernels` (kernels.h) points to
-// them by the same names. All other functions here serve these six.
+// `forward`, `forward_many`, `encode`, `decode`, `set_lobe_probabilities` and `prepare` are the kernels. `Kernels`
+// (kernels.h) points to them by the same names. All other functions here serve these six.
 
 // Computes VECTORS vectors of neurons, the first of which is neuron `first`, for QUERIES queries. A neuron has SUMS
 // partial sums: in a single sum, each multiplication would wait for the one before it. PAIRS says whether the weights
@@ -27,7 +27,7 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
                         bool relu) {
     Vec sums[SUMS][QUERIES][VECTORS];
     NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
-        sums[0][q][v] = load(layer.bias + first + v * LANES);
+        sums[0][q][v] = load(layer.bias + first + v * VEC_SIZE);
         NMA_UNROLL for (int s = 1; s < SUMS; ++s) sums[s][q][v] = set(0.0f);
     }
     const float* column = PAIRS ? nullptr : layer.columns + first;
@@ -37,8 +37,8 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
             if constexpr (PAIRS) {
                 Vec weights[2][VECTORS];
                 NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
-                    weights[0][v] = even(pair + v * LANES);
-                    weights[1][v] = odd(pair + v * LANES);
+                    weights[0][v] = even(pair + v * VEC_SIZE);
+                    weights[1][v] = odd(pair + v * VEC_SIZE);
                 }
                 NMA_UNROLL for (int half = 0; half < 2; ++half) NMA_UNROLL for (int q = 0; q < QUERIES; ++q) {
                     const Vec input = set(x[q * x_stride + i + k + half]);
@@ -50,7 +50,7 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
                 pair += layer.width;
             } else {
                 Vec weights[VECTORS];
-                NMA_UNROLL for (int v = 0; v < VECTORS; ++v) weights[v] = load(column + v * LANES);
+                NMA_UNROLL for (int v = 0; v < VECTORS; ++v) weights[v] = load(column + v * VEC_SIZE);
                 NMA_UNROLL for (int q = 0; q < QUERIES; ++q) {
                     const Vec input = set(x[q * x_stride + i + k]);
                     NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
@@ -65,7 +65,7 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
     NMA_UNROLL for (int q = 0; q < QUERIES; ++q) NMA_UNROLL for (int v = 0; v < VECTORS; ++v) {
         Vec sum = sums[0][q][v];
         NMA_UNROLL for (int s = 1; s < SUMS; ++s) sum = add(sum, sums[s][q][v]);
-        store(y + q * y_stride + first + v * LANES, relu ? max(sum, set(0.0f)) : sum);
+        store(y + q * y_stride + first + v * VEC_SIZE, relu ? max(sum, set(0.0f)) : sum);
     }
 }
 
@@ -74,9 +74,9 @@ template <int VECTORS, int QUERIES, bool PAIRS>
 NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                          bool relu) {
     constexpr int SUMS = QUERIES > 1 || VECTORS >= 8 ? 1 : VECTORS >= 4 ? 2 : 4;
-    for (; first + VECTORS * LANES <= layer.width; first += VECTORS * LANES)
+    for (; first + VECTORS * VEC_SIZE <= layer.width; first += VECTORS * VEC_SIZE)
         tile<VECTORS, QUERIES, SUMS, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
-    if constexpr (VECTORS * LANES > WIDTH_STEP)
+    if constexpr (VECTORS * VEC_SIZE > WIDTH_STEP)
         if (first < layer.width) tiles<VECTORS / 2, QUERIES, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
 }
 
@@ -137,16 +137,16 @@ NMA_FN NMA_WHOLE inline void encode(const Preparation& preparation, const float*
     preparation.encoding.encode(parameters, wi, inputs, preparation.network.layers[0].in);
 }
 
-// Decodes the raw outputs in place and fills in the blend, except for its odds.
+// Decodes the raw outputs in place and fills in the blend, except for its lobe probabilities.
 NMA_FN NMA_WHOLE inline void decode(const Preparation& preparation, float* raw, float cosine, Blend<float>& blend) {
-    for (int k = 0; k < preparation.ranges.count; k += LANES)
+    for (int k = 0; k < preparation.ranges.count; k += VEC_SIZE)
         store(raw + k, decoded(preparation.ranges, k, load(raw + k), 1.0f - cosine * cosine));
     if (preparation.ranges.count <= Few::MOST) assemble(preparation, raw, Few(raw), blend);
     else assemble(preparation, raw, Indexed(raw), blend);
 }
-// Fills in the odds of a decoded blend.
-NMA_FN NMA_WHOLE inline void odds(const Preparation& preparation, float cosine, Blend<float>& blend) {
-    weigh(blend, cosine, preparation.bounded);
+// Fills in the lobe probabilities of a decoded blend.
+NMA_FN NMA_WHOLE inline void set_lobe_probabilities(const Preparation& preparation, float cosine, Blend<float>& blend) {
+    nma::set_lobe_probabilities(blend, cosine, preparation.bounded);
 }
 
 // All steps for one query. FORWARD runs the network.
@@ -157,5 +157,5 @@ NMA_FN inline void prepare(const Preparation& preparation, const float* paramete
     encode(preparation, parameters, wi, inputs);
     FORWARD(preparation.network, inputs, numbers);
     decode(preparation, numbers, wi.z, blend);
-    odds(preparation, wi.z, blend);
+    set_lobe_probabilities(preparation, wi.z, blend);
 }

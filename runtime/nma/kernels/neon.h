@@ -11,7 +11,7 @@
 
 namespace nma::neon {
 
-constexpr int LANES = 4, SINGLE_TILE = 8, BATCH_TILE = 4, BATCH_QUERIES = 6;
+constexpr int VEC_SIZE = 4, SINGLE_TILE = 8, BATCH_TILE = 4, BATCH_QUERIES = 6;
 
 using Vec = float32x4_t;
 

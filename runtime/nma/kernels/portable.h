@@ -12,13 +12,13 @@
 
 namespace nma::portable {
 
-constexpr int LANES = 4, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 2;
+constexpr int VEC_SIZE = 4, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 2;
 
 #if defined(__GNUC__)
 typedef float Vec __attribute__((vector_size(16)));
 #else
 struct Vec {
-    float lanes[LANES];
+    float lanes[VEC_SIZE];
     float& operator[](int k) { return lanes[k]; }
     float operator[](int k) const { return lanes[k]; }
 };
@@ -27,7 +27,7 @@ struct Vec {
 template <class F>
 NMA_OP Vec each(F function) {
     Vec r{};
-    NMA_UNROLL for (int k = 0; k < LANES; ++k) r[k] = function(k);
+    NMA_UNROLL for (int k = 0; k < VEC_SIZE; ++k) r[k] = function(k);
     return r;
 }
 
