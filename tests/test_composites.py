@@ -1,6 +1,6 @@
 """Our BSDFs inside Mitsuba's composite BSDFs: the picture of a composite is the weighted sum of its parts' pictures.
 
-Each integrator renders one sheet of small cells under the same sky, with one cell for each BSDF in each composite.
+Each integrator renders one sheet of small cells under the same sky. Each cell shows one BSDF, alone or in a composite.
 """
 
 import gc
@@ -38,7 +38,7 @@ INTEGRATORS = {
 @pytest.fixture(autouse=True)
 def _variant():
     nma.render.use("llvm_ad_rgb")
-    gc.collect()  # Dr.Jit would also record the BSDFs of old scenes that are not collected yet
+    gc.collect()  # otherwise Dr.Jit would also record the BSDFs of deleted scenes
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +77,8 @@ def normalmap(bsdf):
     return {"type": "normalmap", "normalmap": bitmap_texture(up), "a": bsdf}
 
 
-# For each composite: how to make it from a BSDF, and the weights of three pictures in its picture. These pictures show
-# the BSDF, the diffuse BSDF, and the bare sky.
+# The composites, each with two values: a function that makes the composite from a BSDF, and three weights. The picture
+# of the composite is the sum of three pictures with these weights: of the BSDF, of the diffuse BSDF, and of the sky.
 COMPOSITES = {
     "blendbsdf": (blend, (1 - WEIGHT, WEIGHT, 0.0)),
     "mask": (mask, (OPACITY, 0.0, 1 - OPACITY)),
@@ -90,19 +90,20 @@ COMPOSITES = {
         (OPACITY * (1 - WEIGHT), OPACITY * WEIGHT, 1 - OPACITY),
     ),
 }
-# Every BSDF is tested in COMMON composites. To save compiling, only the BSDFs IN_ALL are tested in all composites:
-# one keeps results between calls, the other simulates walks.
+# Every BSDF is tested in the composites COMMON. To save compile time, only the two BSDFs IN_ALL are tested in all
+# composites. The textured `nma` is one of the two because it keeps results between calls, and `layered` because it
+# simulates random walks.
 COMMON = ("blendbsdf", "nested")
 IN_ALL = ("nma, textured", "layered")
 
 
 def pairs(bsdfs):
-    """Lists the pairs of a BSDF and a composite that have a cell."""
+    """Lists the pairs of a BSDF and a composite that have a cell on the sheet."""
     return [(b, c) for b in bsdfs for c in COMPOSITES if c in COMMON or b in IN_ALL]
 
 
 def cells(bsdfs):
-    """Returns the BSDFs of all cells by name: the diffuse one, a transparent one, our BSDFs, and the composites."""
+    """Returns the BSDFs of all cells by name: the diffuse BSDF, a transparent BSDF, our BSDFs, and the composites."""
     sheet = {"diffuse": DIFFUSE, "none": {"type": "mask", "opacity": 0.0, "a": DIFFUSE}} | bsdfs
     return sheet | {f"{b} in {c}": COMPOSITES[c][0](bsdfs[b]) for b, c in pairs(bsdfs)}
 
@@ -110,7 +111,7 @@ def cells(bsdfs):
 def sheet_scene(sheet, integrator):
     """Loads a scene of flat cells, all seen at 45 degrees, under a sky with a bright patch.
 
-    View and light are the same for all cells and pixels. So all pixels of a cell have the same distribution.
+    All pixels have the same view direction and the same light, so that all pixels of a cell have the same distribution.
     """
     rows = -(-len(sheet) // COLUMNS)
     sky = np.full((8, 16, 3), 0.3, np.float32)
@@ -179,7 +180,10 @@ def measured(scene, names):
 
 
 def scores(found, bsdfs):
-    """Returns by how many standard deviations each composite differs from the weighted sum: name -> (channels,)."""
+    """Returns how many standard deviations each composite differs from the weighted sum of its parts.
+
+    The result is a dictionary from the names of cells to arrays (channels,).
+    """
     result = {}
     for name, composite in pairs(bsdfs):
         weights = COMPOSITES[composite][1]
@@ -188,7 +192,8 @@ def scores(found, bsdfs):
         expected = sum(w * m for w, (m, _) in zip(weights, terms, strict=True))
         spread = variance + sum(w * w * v for w, (_, v) in zip(weights, terms, strict=True))
         z = (mean - expected) / np.sqrt(spread + (1e-4 * expected) ** 2 + 1e-14)
-        # The channels after the first three are albedos. Mitsuba's `mask` does not weigh albedos.
+        # The channels after the first three are albedos. They are not compared for composites with Mitsuba's `mask`,
+        # because `mask` does not multiply albedos by its opacity.
         result[f"{name} in {composite}"] = z[:3] if "mask" in composite or composite == "nested" else z
     return result
 
@@ -204,17 +209,17 @@ def test_composites_are_linear_combinations(bsdfs, integrator):
     off = {name: z.round(1) for name, z in differences.items() if np.abs(z).max() > limit}
     assert not off, (limit, off)
     if integrator == "direct, lights":
-        return  # with light sampling alone, pictures of narrow lobes are too noisy for the check below
-    # The test detects a bias of 3 %, in nearly all cells.
+        return  # with light sampling alone, pictures of narrow lobes are too noisy for the next check
+    # A bias of 3 % would exceed the limit, in the median over the cells of single BSDFs and their colour channels.
     seen = [(0.03 * m / np.sqrt(v + 1e-14))[:3] for m, v in (found[name] for name in bsdfs)]
     assert np.median(seen) > limit
 
 
 @pytest.mark.parametrize("name", ("nma, textured", "nma, anisotropic", "layered"))
 def test_composites_render_in_the_integrator_direct(bsdfs, name):
-    """`direct` evaluates and samples a BSDF in separate calls, and the picture is finite and not black.
+    """The picture of a composite is finite and not black with `direct`, which evaluates and samples in separate calls.
 
-    This is a fast check. The test above compares the values.
+    Only the slow test `test_composites_are_linear_combinations` compares the values of pictures.
     """
     sheet = {"mask": mask(bsdfs[name]), "blend": blend(bsdfs[name])}
     picture = np.array(mi.render(sheet_scene(sheet, INTEGRATORS["direct"]), spp=4))
@@ -230,7 +235,7 @@ def test_composites_can_be_frozen(bsdfs, integrator):
     loaded = sheet_scene(cells(bsdfs), INTEGRATORS[integrator])
     film = {"type": "hdrfilm", "width": 32, "height": 32}
     look = mi.ScalarTransform4f().look_at([4, -18, 20], [4, 2, 0], [0, 0, 1])
-    # Mitsuba's orthographic sensor cannot be frozen.
+    # Mitsuba's orthographic sensor cannot be frozen, so this test uses a perspective sensor.
     sensor = mi.load_dict({"type": "perspective", "fov": 20, "to_world": look, "film": film})
     frozen = dr.freeze(lambda loaded, sensor: mi.render(loaded, sensor=sensor, spp=8))
     expected = np.array(mi.render(loaded, sensor=sensor, spp=8))

@@ -50,7 +50,7 @@ def chunks(path: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Dataset:
-    """The dataset, written by one worker without a break."""
+    """A dataset that one worker wrote without interruption."""
     data = Dataset.create(tmp_path_factory.mktemp("data") / "whole.zarr", SETTINGS)
     data.write()
     return data
@@ -134,7 +134,10 @@ def test_a_chunk_that_was_not_finished_does_not_count(copy):
 
 
 def test_a_writer_that_fails_leaves_no_chunk(tmp_path, monkeypatch):
-    """zarr promises atomic writes. This test fails if a version of zarr breaks the promise."""
+    """A chunk does not exist if writing it failed, because zarr writes files atomically.
+
+    A failure means that a new version of zarr no longer writes atomically.
+    """
     data = Dataset.create(tmp_path / "full.zarr", Settings("layered3", 1, 40, 0))
 
     def full(self, target):

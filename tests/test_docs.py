@@ -22,13 +22,13 @@ import mitsuba as mi  # isort: skip
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/README.md"])
-# The page whose blocks train, and the file of measurements that some blocks read.
+# TRAINING is the page whose code blocks train adapters. MEASURED is the file of measurements that some blocks read.
 TRAINING = "docs/bring-your-own.md"
 MEASURED = "paper_white_rgb.bsdf"
 
 
 def blocks(language):
-    """Returns all code blocks in this language. The keys are page and index, for example docs/python.md-0."""
+    """Returns all code blocks in a language, by keys of page and index, such as docs/python.md-0."""
     return {
         f"{page.relative_to(ROOT)}-{number}": block
         for page in PAGES
@@ -44,7 +44,10 @@ SLOW = [name for name, text in PYTHON.items() if name.startswith(TRAINING) or "L
 
 @pytest.fixture
 def cheap(tmp_path, monkeypatch):
-    """A working folder in which blocks run fast: with a tiny network, one sample per pixel and few training steps."""
+    """A working folder in which code blocks run fast.
+
+    The blocks get a tiny network, one sample per pixel and few training steps.
+    """
     load, tiny, render = Adapter.load, random_adapter(hidden="2x8"), mi.render
     shipped = lambda name: tiny if str(name) in nma.shipped() else load(name)
     monkeypatch.setattr(Adapter, "load", staticmethod(shipped))
@@ -84,7 +87,10 @@ def test_python_blocks_that_train_run(name, cheap, request):
 
 
 def run_block(text, folder):
-    """Runs a block as a program and returns its variables. Pictures must be finite, and files must be written."""
+    """Runs a code block as a program and returns the variables of the program.
+
+    Asserts that its pictures are finite and that the files it writes are not empty.
+    """
     text = text.replace("range(30)", "range(2)")
     if "__main__" in text:
         (folder / "block.py").write_text(text)

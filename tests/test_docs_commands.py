@@ -22,7 +22,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/REA
 
 
 def lines(page):
-    """Returns the commands of a page: the lines of its code blocks without a language, without comments."""
+    """Returns the commands of a page: all lines of code blocks that name no language. Comments are removed."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.M | re.S)
     text = "".join(body for language, body in blocks if not language)
     return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
@@ -30,7 +30,7 @@ def lines(page):
 
 COMMANDS = {str(p.relative_to(ROOT)): [w[1:] for w in lines(p) if w[0] == "nma"] for p in PAGES}
 COMMANDS = {page: commands for page, commands in COMMANDS.items() if commands}
-# Options that the tests append to a command to save time. A later option replaces an earlier one.
+# Options that the tests append to a command to save time. `nma` uses the last value of an option that occurs twice.
 CHEAP = {
     "demo": "--size 16 --spp 1 --runs 2 --reference-spp 2",
     "render": "--size 16 --spp 1",
@@ -42,7 +42,7 @@ CHEAP = {
     "train-library": "--steps 50 --network 1x8",
     "library encode": "--steps 50",
 }
-# Only users with the measured materials have these files.
+# Files that only users with the measured materials have.
 MEASURED = ("paper_white_rgb.bsdf", "merl_nbrdf_weights.npz", "rgl-isotropic_nbrdf_weights.npz")
 
 
@@ -62,7 +62,7 @@ def cheap(words):
 
 
 def parsed(words):
-    """Parses a command line as `nma` does, without running it. Returns the context of the command."""
+    """Parses a command line as `nma` does, without running the command. Returns the click context of the command."""
     command, context = typer.main.get_command(cli.app), None
     name, rest = "nma", list(words)
     while True:

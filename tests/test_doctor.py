@@ -11,8 +11,8 @@ import pytest
 from nma import doctor, llvm
 from nma.errors import MissingDependencyError
 
-# Calls `ensure_llvm`, as every program does before its first kernel, then runs a kernel that an old libLLVM cannot
-# compile.
+# A program that calls `ensure_llvm`, as every program does before it runs its first kernel. Then the program runs a
+# kernel that an old libLLVM cannot compile.
 FIRST_KERNEL = """
 from nma.errors import NmaError
 from nma.llvm import ensure_llvm

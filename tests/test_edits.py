@@ -1,4 +1,4 @@
-"""Edits of our BSDFs take effect at once, compile no kernel, are checked, and work inside frozen functions."""
+"""Edits of our BSDFs are checked, take effect at once, compile no new kernel, and work inside frozen functions."""
 
 import gc
 import os
@@ -20,8 +20,9 @@ nma.render.use("llvm_ad_rgb")
 @pytest.fixture(autouse=True)
 def _variant():
     nma.render.use("llvm_ad_rgb")
-    # Frozen functions and errors form reference cycles with their scenes. We collect these scenes now: if Python
-    # collected one while Dr.Jit records another, Mitsuba would call BSDFs that no longer exist.
+    # Frozen functions and errors form reference cycles with scenes, and only the garbage collector frees such scenes.
+    # The collector runs here, because Mitsuba would call deleted BSDFs if a scene were freed while Dr.Jit records
+    # another scene.
     gc.collect()
 
 
@@ -62,7 +63,7 @@ def picture(loaded, spp=16, seed=0):
 
 @pytest.fixture
 def compiled():
-    """A function that runs its argument and returns the count of kernels that were compiled meanwhile."""
+    """A function that calls another function and returns how many kernels this call compiled."""
 
     def count(function):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -94,7 +95,7 @@ def test_an_edit_compiles_nothing(adapter, compiled, kind):
         params.update()
         return picture(loaded)
 
-    edit((0.5, 0.4, 0.3))  # the first edit compiles small kernels of its own
+    edit((0.5, 0.4, 0.3))  # the first edit may compile a few small kernels
     after = []
     assert compiled(lambda: after.append(edit((0.9, 0.1, 0.2)))) == 0
     assert np.abs(after[0] - before).max() > 0.01
@@ -130,7 +131,7 @@ def test_loading_many_materials_leaves_memory_flat():
 
 @pytest.mark.parametrize("kind", [*BESIDE, "blendbsdf"])
 def test_frozen_functions_render_edited_values(adapter, kind):
-    """A frozen function renders edits that were made outside or inside of it, with at most two recordings."""
+    """A frozen function shows edits that were made before its call or by itself, and is recorded at most twice."""
     blend = {"type": "blendbsdf", "weight": 0.3, "a": adapter | {"alpha_bottom": TEXTURE}, "b": LAYERED}
     loaded = scene(blend if kind == "blendbsdf" else BESIDE[kind](adapter))
     params = mi.traverse(loaded)
@@ -157,10 +158,10 @@ def test_frozen_functions_render_edited_values(adapter, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ("plain", "textured"))
 def test_frozen_functions_see_derivatives_of_numbers_set_before(adapter, kind):
-    """Derivatives by an input that was set before the call agree within 2 %, with and without `dr.freeze`.
+    """A frozen function and the same function without `dr.freeze` return equal derivatives by `sigma_t`, within 2 %.
 
-    The curves of a plain material are computed before the call, so that the frozen function receives both the input and
-    the curves.
+    `sigma_t` is set before the function is called. The curves of an untextured material are also computed before the
+    call, so that the frozen function receives both `sigma_t` and the curves.
     """
 
     def derive(loaded, params):
@@ -200,11 +201,14 @@ WRONG_AT_LOAD = {
 
 @pytest.mark.parametrize("kind", WRONG_AT_LOAD)
 def test_a_refused_bsdf_does_not_stop_other_scenes(adapter, kind):
-    """Other scenes render although the error keeps a reference to the refused BSDF. Notebooks keep such errors."""
+    """Scenes still render while an error object keeps a reference to a BSDF that was refused.
+
+    Notebooks keep error objects in this way.
+    """
     expected = picture(scene(LAYERED))
     with pytest.raises(RuntimeError) as error:
         mi.load_dict(WRONG_AT_LOAD[kind](adapter))
-    # A film adds samples in any order, so that pictures differ by rounding.
+    # The film adds samples in random order, so that pictures of the same scene differ by rounding.
     np.testing.assert_allclose(picture(scene(LAYERED)), expected, rtol=1e-5)
     assert error.value.__traceback__ is not None
 
@@ -257,7 +261,7 @@ def test_of_several_edits_only_the_wrong_ones_are_undone(adapter, kind):
 
 
 def test_values_that_frozen_functions_set_are_clamped(adapter):
-    """A value beyond its bounds that a frozen function sets renders as the nearest allowed value.
+    """If a frozen function sets a value beyond its bounds, the picture shows the nearest allowed value.
 
     Later renderings outside of the frozen function also show the clamped value.
     """
@@ -278,14 +282,17 @@ def test_values_that_frozen_functions_set_are_clamped(adapter):
 
 
 def shared_key(params, leaf):
-    """Returns the key of the shared texture in `params`. The key begins with the first object that uses the texture."""
+    """Returns the key in `params` of a texture that two objects share. The key begins with the first object's name."""
     (key,) = (key for key in params.keys() if key.endswith(f".{leaf}") and "sky" not in key)  # noqa: SIM118
     return key
 
 
 @pytest.mark.parametrize("kind", ("nma", pytest.param("layered", marks=pytest.mark.slow)))
 def test_edits_of_shared_textures_show_and_are_checked(adapter, kind):
-    """A BSDF sees and checks edits of a shared texture, although Mitsuba notifies only the other object that has it."""
+    """Our BSDF uses and checks the edits of a texture that it shares with another object.
+
+    Mitsuba notifies only the other object of such edits.
+    """
     shared = {"type": "ref", "id": "shared"}
     first = {"type": "sphere", "center": [0, 0, -9], "bsdf": {"type": "diffuse", "reflectance": shared}}
     colours = ([0.1, 0.5, 0.9], [0.9, 0.1, 0.1])
@@ -309,7 +316,7 @@ def test_edits_of_shared_textures_show_and_are_checked(adapter, kind):
         params[key] = kind_of(np.full((2, 2, 3), np.nan, np.float32)) if leaf == "data" else kind_of(np.nan)
 
         def update_and_render(loaded=loaded, params=params):
-            params.update()  # Mitsuba notifies only one of the two objects
+            params.update()  # Mitsuba notifies only the diffuse sphere
             picture(loaded)
 
         refused(update_and_render, "albedo")

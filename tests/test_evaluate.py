@@ -38,7 +38,10 @@ BLENDS = {
 
 
 def constant(blend, slope=0.0):
-    """Returns an adapter whose target is `blend`. With a slope, raw outputs change linearly with cos(theta_i)."""
+    """Returns an adapter whose target is `blend` at every direction.
+
+    If `slope` is not 0, the raw outputs of the network also change linearly with cos(theta_i).
+    """
     raw = np.array(target.encode(blend), np.float32)
     change = slope * np.random.default_rng(1).standard_normal(len(raw)).astype(np.float32)
     return Adapter(
@@ -48,21 +51,21 @@ def constant(blend, slope=0.0):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Integrates with few directions, for tests that do not depend on the exact values."""
+    """Makes evaluations integrate over few directions, for tests that do not depend on exact values."""
     monkeypatch.setattr(adapters, "_DIRECTIONS", 4)
 
 
 @cache
 def halves(name, slope):
-    """Returns two independent tables of an adapter, made as an evaluation makes them."""
+    """Returns two tables of an adapter with different integration points, as an evaluation computes them."""
     adapter = constant(BLENDS[name], slope)
     return [tabulate_adapter(adapter, PARAMS[:1], shift=s)[0] for s in (0.0, 0.5)]
 
 
 def fine_means(adapter, bins, points=1 << 11, repeats=6):
-    """Returns the means over `bins` (n, 3) and their standard errors, both (n, 3).
+    """Returns the adapter's mean value in each of `bins` (n, 3), and the standard errors of the means, both (n, 3).
 
-    The means are over many points, which concentrate near peaks. Each point prepares the adapter for its own wi.
+    Each mean is over many points, which concentrate near peaks. The adapter is prepared for the wi of every point.
     """
     Float = dr.auto.Float
     means = []
@@ -100,10 +103,10 @@ def elsewhere(n):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slope"), [*((name, 1.0) for name in BLENDS), ("alpha .001", 0.0)])
 def test_the_stated_error_of_integration_covers_the_actual_error(name, slope):
-    """The actual log loss of the mean of two tables is at most 1.6 times the stated one plus 3e-5.
+    """The log loss of the mean of two tables is at most 1.6 times the log loss that an evaluation states, plus 3e-5.
 
-    Fine integration gives the truth, around the mirror direction and elsewhere. A failure means that an evaluation
-    claims more accuracy than it has.
+    The log loss is measured against fine integration, around the mirror direction and elsewhere. A failure means that
+    an evaluation claims more accuracy than it has.
     """
     adapter = constant(BLENDS[name], slope)
     first, second = halves(name, slope)
@@ -116,7 +119,7 @@ def test_the_stated_error_of_integration_covers_the_actual_error(name, slope):
         truth, error = fine_means(adapter, bins)
         actual += part * np.abs(table[at] - np.log1p(truth)).mean()
         claimed += part * stated[at].mean()
-        # The error of the fine integration is much smaller than the errors that it judges.
+        # The error of the fine integration itself is much smaller than the errors of the tables.
         assert part * np.mean(error / (1.0 + truth)) < 5e-5
     assert actual < 1.6 * claimed + 3e-5
     assert claimed < 2e-4
@@ -188,7 +191,7 @@ def test_an_evaluation_is_json_and_says_that_errors_are_estimated():
     for figure in metrics.FIGURES:
         assert result.mean[figure] == pytest.approx(np.mean([m[figure] for m in result.materials]))
     assert result.mean["noise_floor"] > 0.0
-    # The reference is 10 % brighter, so that the albedo error is near a tenth of the albedo.
+    # The reference is 10 % brighter, so that the albedo error is near a tenth of the albedo, which is about .6.
     assert result.mean["albedo_error"] == pytest.approx(0.1 * 0.6, rel=0.15)
 
 
@@ -205,7 +208,7 @@ def test_references_that_cannot_be_compared_are_refused():
 def test_materials_beyond_the_training_range_are_refused_or_clamped():
     """An evaluation refuses a parameter beyond the training range, or clamps it on request.
 
-    Otherwise the figures would judge how the network extrapolates.
+    Otherwise the figures of merit would measure how well the network extrapolates.
     """
     layers = [
         (
@@ -235,7 +238,7 @@ def test_an_adapter_of_one_material_is_not_compared_with_another():
 
 
 def test_figures_are_their_formulas():
-    """The figures of a table of two rows and two bins equal values that are computed by hand."""
+    """The figures of merit of a table of two rows and two bins equal values that are computed by hand."""
     a = np.zeros((2, 1, 2, 3))
     b = np.zeros((2, 1, 2, 3))
     a[0, 0, :, :] = [[0.2] * 3, [0.4] * 3]
@@ -265,14 +268,16 @@ def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
     error = scale * rng.uniform(0.0, 1.0, 500)
     noise = np.maximum(b + error * rng.standard_normal((20_000, 500)), -0.999)
     expected = np.abs(np.log1p(noise) - np.log1p(b)).mean()
-    # The quadrature of 16 values per sign is exact if the logarithm is linear, and close enough otherwise.
+    # The noise floor is a sum over 16 positive and 16 negative noise values. For small noise the logarithm is almost
+    # linear, and the sum is almost exact. For large noise the sum is less precise.
     assert noise_floor(b, error) == pytest.approx(expected, rel=0.004 if scale < 1.0 else 0.03)
 
 
 def test_counting_errors_are_exact_for_walks_of_throughput_1():
-    """The stated error is the standard deviation of tables whose walks all have throughput 1, within 5 %.
+    """If all walks have throughput 1, the standard deviation of a bin is that of `counting_error`, within 5 %.
 
-    The count of walks in such a bin is binomial, and eq. 9 converts the count to a value.
+    The count of walks in the bin is binomial, and eq. 9 of the paper converts the count to a value. `counting_error`
+    leaves out the factor sqrt(1 - p) of the binomial, where p is the probability of the bin.
     """
     rows, walks, omega = 4, 4_000_000, 2.0 * math.pi / 100
     chance = np.array([0.001, 0.01, 0.05])

@@ -1,4 +1,7 @@
-"""Every experiment of `figures/` runs in its quick form and writes its results. New experiments are found by name."""
+"""Every experiment in `figures/` runs in its quick form and writes its results.
+
+The tests search the folder for experiments, so that new experiments are tested too.
+"""
 
 import json
 import os

@@ -25,7 +25,7 @@ def contents(folder: Path) -> list[str]:
 
 @pytest.fixture
 def places(tmp_path) -> dict[str, Path]:
-    """Paths that cannot be written. Each key is a part of the error message that writing to its path must raise."""
+    """Paths that cannot be written, each with a part of the error message that a write to the path must raise."""
     (tmp_path / "folder.npz").mkdir()
     (tmp_path / "file").write_text("mine")
     return {
@@ -113,7 +113,7 @@ WRITERS = {
 def test_a_full_disk_raises_one_line_and_leaves_no_file(tmp_path, monkeypatch, writer):
     """On a full disk the error of every writer is one line, and no file remains.
 
-    Every writer uses `whole`. Its last step, `Path.replace`, fails here.
+    Every writer uses `whole`. The test makes the last step of `whole` fail, which is a call of `Path.replace`.
     """
     monkeypatch.setattr(Path, "replace", _full)
     with pytest.raises(OutputError, match="No space left on device.*free some space"):
@@ -149,7 +149,7 @@ def test_a_link_stays_and_the_file_that_it_names_is_replaced(tmp_path):
 
 
 def test_the_trial_is_made_where_a_link_leads(tmp_path, monkeypatch):
-    """`try_file` tests the folder that `whole` writes to. For a link, this is the folder of the file it names."""
+    """If a path is a symbolic link, `try_file` tests the folder of the linked file, because `whole` writes there."""
     real, link = tmp_path / "there" / "real.npz", tmp_path / "link.npz"
     real.parent.mkdir()
     link.symlink_to(real)

@@ -1,4 +1,7 @@
-"""All code writes files by `nma.files`, completely or not at all. The tests search for other calls that write."""
+"""All code writes files through `nma.files`, so that no partly written file remains after an error.
+
+The tests search the code for calls that write files in other ways.
+"""
 
 import ast
 from collections.abc import Iterator
@@ -10,7 +13,8 @@ ROOT = Path(__file__).parents[1]
 # Methods and functions that write, rename or copy files, on any object and in any module.
 WRITERS = {"write_text", "write_bytes", "save_file", "savez", "savez_compressed", "savefig", "tofile"}
 WRITERS |= {"NamedTemporaryFile", "mkstemp", "mkdtemp", "rename", "copytree", "copyfile", "copy2", "move"}
-# Functions that write or rename files, with their modules, because the names alone are also those of other functions.
+# Functions that write or rename files. Their entries include the module, because other modules have functions of the
+# same name.
 OF_MODULES = {"np.save", "json.dump", "os.replace"}
 # Blocks of these context managers fill a temporary file or folder, which gets its final name at the end.
 WHOLE = {"whole", "whole_folder"}
@@ -55,7 +59,8 @@ def is_write(call: ast.Call) -> bool:
             if isinstance(arg, ast.Constant)
         ]
         return any(isinstance(text, str) and text[:1] in "wax" and len(text) < 4 for text in mode)
-    # `str.replace` has two arguments and `dataclasses.replace` has keywords. `Path.replace` has one argument.
+    # `Path.replace`, which renames a file, has one argument. `str.replace` has two arguments, and `dataclasses.replace`
+    # has keyword arguments.
     return name(call) == "replace" and "." in called and len(call.args) == 1 and not call.keywords
 
 

@@ -31,7 +31,7 @@ MATERIAL = {
     "albedo": rgb(0.8, 0.4, 0.3),
     "sigma_t": 0.7,
 }
-# Materials, each with parameters to differentiate by, and with a direction of change for each parameter.
+# Materials, each with the parameters to differentiate by. For each parameter there is a direction of change.
 CASES = {
     "plain": (
         MATERIAL,
@@ -74,7 +74,10 @@ def scene(bsdf, depth, sky, beside=None):
 
 
 def replaced(params, key, value):
-    """Sets a parameter to `value`, converted to its type. Enables derivatives by the parameter, which start at zero."""
+    """Sets a parameter to `value`, converted to the parameter's type.
+
+    Enables derivatives by the parameter and resets their sum to zero.
+    """
     kind = type(params[key])
     numbers = np.asarray(value, np.float32)
     params[key] = kind(numbers) if kind is mi.TensorXf else kind(numbers.ravel().tolist())
@@ -82,7 +85,7 @@ def replaced(params, key, value):
 
 
 def slopes(loaded, directions, step, spp, seeds):
-    """Returns derivatives of the mean of a picture along each direction, by `prb` and by central differences.
+    """Returns the derivatives of a picture's mean along each direction of change, by `prb` and by central differences.
 
     Both results are dictionaries of arrays (seeds,), by the keys of `directions`.
     """
@@ -93,7 +96,7 @@ def slopes(loaded, directions, step, spp, seeds):
         for key, value in start.items():
             replaced(params, key, value)
         params.update()
-        # `seed_grad` is the seed of the pass for derivatives. The pictures below use the same seed.
+        # `seed_grad` is the seed of the pass for derivatives. The pictures for the differences use the same seed.
         picture = mi.render(loaded, params, spp=spp, seed=seeds + seed, seed_grad=seed)
         dr.backward(dr.mean(picture, axis=None))
         for key, d in directions.items():
@@ -114,7 +117,10 @@ def slopes(loaded, directions, step, spp, seeds):
 
 
 def case(name, folder):
-    """Returns a case by its name. The textured case gets a small random adapter, whose derivatives are large."""
+    """Returns the material and the directions of change of one of CASES.
+
+    The textured material gets a small random adapter, whose derivatives are large.
+    """
     bsdf, directions = CASES[name]
     if name == "textured":
         random_adapter(hidden="2x8", seed=5).save(folder / "small.safetensors")
@@ -141,7 +147,8 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
 def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
     """Derivatives equal finite differences within four standard errors over 8 seeds, with indirect light.
 
-    Sampling makes derivatives and differences noisy. The false-alarm rate is .007 in all, by Student's t.
+    Sampling makes derivatives and differences noisy. The false-alarm rate over all comparisons together is .007, by
+    Student's t.
     """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}
@@ -160,7 +167,7 @@ def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
 def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
     """Forward and backward derivatives agree within 1e-3 in a scene of several BSDFs.
 
-    Dr.Jit traces each of several BSDFs in a scope of its own, which derivatives must cross.
+    Dr.Jit traces each BSDF as a separate function call, and derivatives must propagate into and out of these calls.
     """
     bsdf, directions = case(name, tmp_path)
     within, key = (
@@ -193,7 +200,7 @@ def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
 def test_optimisation_finds_a_texture():
     """Optimisation recovers the albedo texture of a sheet under a uniform sky.
 
-    Its 27 values are off by less than .02 on average and .08 at worst.
+    The 27 values of the texture are off by less than .02 on average and .08 at worst.
     """
     wanted = np.random.default_rng(2).uniform(0.1, 0.9, (3, 3, 3))
     bsdf = MATERIAL | {"sigma_t": 1.0, "albedo": bitmap_texture(np.full((3, 3, 3), 0.5))}

@@ -29,13 +29,13 @@ SHORT = replace(CONSTANT, steps=400, rows=16, points=32)
 
 @pytest.fixture(scope="module")
 def red() -> Tables:
-    """The table of `RED`, tabulated from Mitsuba's own plugin."""
+    """The table of the BRDF `RED`, computed with Mitsuba's own plugin `principled`."""
     return tabulate_values(from_dict(principled_dict(RED)), points=16)
 
 
 @pytest.fixture(scope="module")
 def coated(red) -> Tables:
-    """The table of `RED` with the parameters of a layered material, so that it belongs to the class `layered3`."""
+    """The table of the BRDF `RED` as if it were a table of the class `layered3`, with the parameters of that class."""
     return Tables(LAYERED3.sample(np.random.default_rng(0), 1), red.values, red.walks)
 
 
@@ -68,10 +68,10 @@ def test_the_best_of_several_fits_has_the_least_error_of_values_and_albedo(fit):
 
 @pytest.mark.slow
 def test_a_highlight_that_the_log_loss_ignores_keeps_its_energy():
-    """A fit to copper under a blue medium and a smooth coat keeps its brightness within 4 %.
+    """A fit to copper under a blue medium and a smooth coat is as bright as that material, within 4 %.
 
-    A fit of the log loss alone was 14 % too dark, with an albedo error of .076. A failure means that the loss no longer
-    weighs the albedo.
+    A fit that minimised the log loss alone was 14 % too dark, with an albedo error of .076. A failure means that the
+    loss no longer contains the albedo error.
     """
     changes = {
         "alpha_top": 0.002,
@@ -115,7 +115,10 @@ def lanes(w: Vec3) -> Vec3:
 
 
 def instances() -> list[Principled]:
-    """Returns random parameters, and some at the ends of `specular`, for which the export may write `eta` instead."""
+    """Returns random BRDFs, and BRDFs with `specular` near the ends of its range.
+
+    Near the ends, the export may write the parameter `eta` in place of `specular`.
+    """
     many = random_principled(np.random.default_rng(4), 8)
     one = [
         Principled(Color(*(float(c[n]) for c in many.base_color)), *(float(x[n]) for x in many[1:11]))
@@ -168,7 +171,10 @@ def test_parameters_that_mitsuba_does_not_allow_are_refused(change):
 
 @pytest.fixture
 def fitted(fit, monkeypatch) -> list[tuple]:
-    """Makes the command return `fit` for every input. The value is the list of (tables, record) given to the fit."""
+    """Makes the command use the fixture `fit` as the result for every input.
+
+    The value of `fitted` is a list of the pairs (tables, record) that the command gave to `fit_constant`.
+    """
     given = []
 
     def find(tables, recipe, record, **options):
@@ -181,9 +187,9 @@ def fitted(fit, monkeypatch) -> list[tuple]:
 
 @pytest.mark.slow
 def test_the_command_prints_json_and_nothing_else_on_stdout(nma, fit, red, monkeypatch, tmp_path):
-    """The command prints the result of `fit_constant`, because equal arguments give equal results.
+    """The command prints the same BRDF as the fixture `fit`, because `fit_constant` is deterministic.
 
-    The table in this test belongs to no class, because the fit needs no parameters of the material.
+    The table in this test has no class and no parameters of a material, because the fit does not need them.
     """
     monkeypatch.setattr("nma.train.principled.CONSTANT", SHORT)
     red.save(tmp_path / "red.npz")
