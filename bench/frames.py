@@ -29,8 +29,8 @@ from bench.scenes import RR_DEPTH, digest
 from figures import common
 from nma.cli.console import progress
 from nma.render.load import load_dict
-from nma.render.measure import render_seconds
 from nma.render.progressive import render_passes
+from nma.render.statistics import render_seconds
 
 ROOT = Path(__file__).parents[1]
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import nma.render
 from nma.jit import dr
 from nma.materials import names
 from nma.render.bsdf import blended
-from nma.render.measure import measure, zscore_images
+from nma.render.statistics import measure, zscore_images
 from nma.render.textures import bitmap_texture
 from nma.sources import layered_eval
 

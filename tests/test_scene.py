@@ -14,7 +14,7 @@ import mitsuba as mi  # noqa: E402
 
 mi.set_variant("llvm_ad_rgb")
 
-from nma.render import measure as measuring  # noqa: E402
+from nma.render import statistics  # noqa: E402
 from nma.render.lighting import LIGHTINGS  # noqa: E402
 from nma.render.scene import CAMERAS, Camera, material_coverage, preview_scene  # noqa: E402
 from nma.render.shaderball import shader_ball, shader_ball_file  # noqa: E402
@@ -209,8 +209,8 @@ def test_bitmap_texture_keeps_values(textures):
 
 def test_measure_returns_mean_and_variance_over_seeds():
     scene = mi.load_dict(preview_scene(GREY, size=(12, 12)))
-    result = measuring.measure(scene, 4, [3, 5, 9], warmup=False)
-    runs = np.stack([measuring.render_seconds(scene, 4, seed)[0] for seed in (3, 5, 9)])
+    result = statistics.measure(scene, 4, [3, 5, 9], warmup=False)
+    runs = np.stack([statistics.render_seconds(scene, 4, seed)[0] for seed in (3, 5, 9)])
     np.testing.assert_allclose(result.mean, runs.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(result.variance, runs.var(axis=0, ddof=1), rtol=1e-5, atol=1e-9)
     assert (runs[0] != runs[1]).mean() > 0.99
@@ -222,7 +222,7 @@ def test_measure_returns_mean_and_variance_over_seeds():
 @pytest.mark.parametrize("seeds", [1, [4], [2, 2]])
 def test_measure_wants_different_seeds(seeds):
     with pytest.raises(ParamError):
-        measuring.measure(None, 1, seeds)
+        statistics.measure(None, 1, seeds)
 
 
 def test_ztest_false_alarms_are_as_stated():
@@ -235,7 +235,7 @@ def test_ztest_false_alarms_are_as_stated():
     for _ in range(400):
         a, b = rng.normal(1.0, 0.1, size=(2, 8, 6, 6, 3))
         args = [part for runs in (a, b) for part in (runs.mean(axis=0), runs.var(axis=0, ddof=1), 8)]
-        alarms += not measuring.zscore_images(*args, false_alarm=0.05, block=2).passed
+        alarms += not statistics.zscore_images(*args, false_alarm=0.05, block=2).passed
     assert 6 <= alarms <= 38
 
 
@@ -245,14 +245,14 @@ def test_ztest_of_renders_accepts_equal_and_rejects_two_percent_of_energy():
     Each render has 24 x 24 pixels and 32 samples per pixel. The false-alarm rate is 1 %; seeds are fixed.
     """
     scene = mi.load_dict(preview_scene(GREY, size=(24, 24)))
-    one = measuring.measure(scene, 32, range(12), warmup=False)
-    two = measuring.measure(scene, 32, range(100, 112), warmup=False)
+    one = statistics.measure(scene, 32, range(12), warmup=False)
+    two = statistics.measure(scene, 32, range(100, 112), warmup=False)
     for block in (1, 8):
-        equal = measuring.zscore_images(
+        equal = statistics.zscore_images(
             one.mean, one.variance, one.runs, two.mean, two.variance, two.runs, block=block
         )
         assert equal.passed, (equal.worst, equal.p_values.min(), equal.level)
-    brighter = measuring.zscore_images(
+    brighter = statistics.zscore_images(
         one.mean, one.variance, one.runs, 1.02 * two.mean, 1.02**2 * two.variance, two.runs, block=8
     )
     assert not brighter.passed
@@ -261,8 +261,8 @@ def test_ztest_of_renders_accepts_equal_and_rejects_two_percent_of_energy():
 
 def test_ztest_handles_images_without_noise():
     image, none = np.ones((4, 4, 3)), np.zeros((4, 4, 3))
-    assert measuring.zscore_images(image, none, 1, image * (1.0 + 1e-6), none, 1).passed
-    assert not measuring.zscore_images(image, none, 1, image * 1.001, none, 1).passed
+    assert statistics.zscore_images(image, none, 1, image * (1.0 + 1e-6), none, 1).passed
+    assert not statistics.zscore_images(image, none, 1, image * 1.001, none, 1).passed
 
 
 @pytest.mark.parametrize("fault", ["shape", "nan", "block"])
@@ -270,7 +270,7 @@ def test_ztest_refuses_images_that_cannot_be_compared(fault):
     image, block = np.ones((4, 4, 3)), 8 if fault == "block" else 1
     other = {"shape": np.ones((4, 5, 3)), "nan": np.full((4, 4, 3), np.nan)}.get(fault, image)
     with pytest.raises(ImageError):
-        measuring.zscore_images(image, image, 2, other, image, 2, block=block)
+        statistics.zscore_images(image, image, 2, other, image, 2, block=block)
 
 
 def render(scene: dict, spp: int) -> np.ndarray:

@@ -16,9 +16,9 @@ from nma.images.metrics import difference_image, errors, flip_map
 from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
 from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
-from nma.render.measure import Measurement, measure, render_seconds
 from nma.render.progressive import render_passes, sampler
 from nma.render.scene import preview_scene
+from nma.render.statistics import Measurement, measure, render_seconds
 from nma.render.textures import bitmap_texture, procedural_textures
 
 HEADINGS = ("material", "BSDF", "time", "compile", "variance", "HDR-FLIP", "SMAPE", "efficiency")
