@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 
 _TRACEBACK = "Traceback (most recent call last):"
-_LONGEST = 600  # most characters of a message: some of Mitsuba's errors print whole objects
+_LONGEST = 600  # longer messages are shortened, because some of Mitsuba's errors print whole objects
 
 
 class NmaError(Exception):
@@ -34,7 +34,7 @@ class DatasetError(NmaError, ValueError):
 
 
 class SourceError(NmaError, ValueError):
-    """A file of measurements or weights, or a renderer's BSDF, is missing, damaged, or of a kind no source can read."""
+    """A file of measurements or weights, or a renderer's BSDF, is missing, damaged, or of an unknown kind."""
 
 
 class TableError(NmaError, ValueError):
@@ -56,19 +56,19 @@ def either(words: Iterable[str]) -> str:
 
 
 def closest(given: str, known: Sequence[str]) -> str | None:
-    """The known name that was probably meant, whatever its case."""
+    """The known name that is most similar to `given`, ignoring case, or None if no name is similar."""
     names = {name.casefold(): name for name in reversed(known)}
     near = difflib.get_close_matches(given.casefold(), names, n=1, cutoff=0.5)
     return names[near[0]] if near else None
 
 
 def some(names: Sequence[str]) -> str:
-    """The first few names, where there may be hundreds."""
+    """Joins the first five names to a text, because there may be hundreds."""
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def hint(given: str, known: Sequence[str]) -> str:
-    """What to say to an unknown name: the closest one, or some of those there are."""
+    """The advice for an unknown name: a similar name, or the first of the known names."""
     near = closest(given, known)
     return f"did you mean '{near}'?" if near else f"it has {some(known)}"
 
@@ -82,7 +82,7 @@ def one_line(message: str) -> str:
     message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
     head, traceback, _ = message.partition(_TRACEBACK)
     if traceback:
-        # The lines of a traceback are indented. The lines after them are the error.
+        # The lines of a traceback are indented. The error is in the lines after the indented lines.
         error = re.search(
             r"^(?!\s)(?:[\w.]+: )?(.*)", message.rpartition(_TRACEBACK)[2].lstrip("\n"), re.M | re.S
         )

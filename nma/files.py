@@ -13,7 +13,7 @@ from typing import Any
 
 from nma.errors import NmaError, OutputError
 
-# The bytes of a test file. They are needed because on a full disk an empty file can still be created, but not written.
+# The content of a test file. The file must not be empty, because an empty file can be created even on a full disk.
 _TRIAL = bytes(1 << 16)
 _ADVICE = {
     errno.ENOSPC: "free some space, or choose another place",
@@ -24,12 +24,13 @@ _ADVICE = {
 
 @contextmanager
 def whole(path: str | Path) -> Iterator[Path]:
-    """Gives the `with` block a temporary file, which replaces `path` when the block ends and is deleted if it fails.
+    """Gives the `with` block a temporary file, which replaces `path` when the block ends and is deleted if the block
+    fails.
 
         with whole("gold.npz") as file:
             np.savez(file, ...)
 
-    The temporary file has the same suffix as `path`. Missing folders are made. A file that exists keeps its
+    The temporary file has the same suffix as `path`. Missing folders are made. If `path` exists, the new file has its
     permissions. Raises `OutputError` if the file cannot be written.
     """
     path = Path(path)
@@ -51,9 +52,11 @@ def whole(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Gives the `with` block a temporary folder, which becomes `path` when the block ends and is deleted if it fails.
+    """Gives the `with` block a temporary folder, which becomes `path` when the block ends and is deleted if the block
+    fails.
 
-    If another process has made the same folder in the meantime, that folder stays.
+    If another process has made the folder `path` in the meantime, that folder stays and the temporary folder is
+    deleted.
     """
     partial = _partial(path)
     try:
@@ -83,8 +86,8 @@ def write_text(path: str | Path, content: str) -> None:
 
 @contextmanager
 def arrays(path: str | Path) -> Iterator[Any]:
-    """The arrays of an .npz file, by name. Raises `ValueError` for other files; NumPy would suggest to unpickle
-    them."""
+    """The arrays of an .npz file, by name. Raises `ValueError` for other files, because NumPy's message would suggest
+    unpickling."""
     import numpy as np
 
     with Path(path).open("rb") as file:
@@ -96,7 +99,7 @@ def arrays(path: str | Path) -> Iterator[Any]:
 
 
 def try_file(*paths: str | Path) -> None:
-    """Tests whether files can be written, so that hours of work are not lost at the end. It leaves nothing behind.
+    """Tests whether files can be written, so that hours of work are not lost at the end. No file is left behind.
 
     Raises `OutputError` if a folder or a device has the name of a file, if a file has the name of a folder, if a name
     is too long, or if the disk is full or read-only.
@@ -111,7 +114,7 @@ def try_file(*paths: str | Path) -> None:
 
 
 def try_folder(path: str | Path) -> None:
-    """Tests whether files can be written to a folder, which need not exist yet. Raises `OutputError`, as `try_file`."""
+    """Tests whether files can be written to a folder, which need not exist yet. Raises `OutputError`."""
     path = Path(path)
     try:
         _try_folder(path)
@@ -126,7 +129,7 @@ def _try_folder(folder: Path, *names: str) -> None:
         missing.append(folder.name)
         folder = folder.parent
     for name in missing:
-        # A name that is too long fails in every folder.
+        # A name that is too long fails in every folder, so `lstat` can test the name in this folder.
         with suppress(FileNotFoundError):
             os.lstat(folder / name)
     trial = _partial(folder / "trial")
@@ -138,7 +141,7 @@ def _try_folder(folder: Path, *names: str) -> None:
 
 
 def _place(path: Path) -> Path:
-    """Where the file is written: a symbolic link stays, and the file that it names is replaced."""
+    """The path of the file that is replaced. For a symbolic link, this is the path of its target, so the link stays."""
     return Path(os.path.realpath(path))
 
 

@@ -14,8 +14,8 @@ from nma.ops import Color, Float, Vec3
 def ggx_d(m: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
     """GGX distribution D(m) [1/sr]: the area of microfacets with normal `m` per solid angle and unit of surface area.
 
-    Heitz 2014, eq. 84. It is written with the slopes m.x / alpha_x and m.y / alpha_y. Near the peak of a narrow lobe,
-    1 - cos^2 would lose all digits in single precision.
+    Heitz 2014, eq. 84. The formula uses m.x / alpha_x and m.y / alpha_y, because 1 - cos^2 would lose all digits in
+    single precision near the peak of a narrow lobe.
     """
     sx = m.x / alpha_x
     sy = m.y / alpha_y
@@ -47,7 +47,8 @@ def sample_visible_normal(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u
     phi = (2.0 * ops.PI) * u1
     z = 1.0 - u2 * (1.0 + wi_std.z)
     sin_theta = ops.safe_sqrt(1.0 - z * z)
-    # The half vector of this point and wi_std is a visible normal of the unit hemisphere. Stretch it back.
+    # The half vector of this point and wi_std is a visible normal of the unit hemisphere. Scale this normal back to the
+    # widths alpha.
     m_std = Vec3(sin_theta * ops.cos(phi), sin_theta * ops.sin(phi), z) + wi_std
     return ops.normalize(Vec3(alpha_x * m_std.x, alpha_y * m_std.y, ops.maximum(m_std.z, 1e-9)))
 
@@ -60,17 +61,18 @@ def reflect(w: Vec3, m: Vec3) -> Vec3:
 def refract(w: Vec3, m: Vec3, cos_t: Float, eta: Float) -> Vec3:
     """The direction `w` refracted at a facet with normal `m` (w.m > 0). Walter 2007, eq. 40.
 
-    `eta` is the index of refraction beyond the facet divided by the index on `w`'s side. `cos_t` is the cosine of
-    refraction, from `fresnel_dielectric`.
+    `eta` is the index of refraction beyond the facet divided by the index on `w`'s side. `cos_t` is the cosine of the
+    refracted direction, from `fresnel_dielectric`.
     """
     return m * (ops.dot(w, m) / eta - cos_t) - w * (1.0 / eta)
 
 
 def fresnel_dielectric(cos_i: Float, eta: Float) -> tuple[Float, Float]:
-    """Unpolarised reflectance and cosine of refraction for cos_i >= 0; (1, 0) at total internal reflection.
+    """Unpolarised reflectance and cosine of the refracted direction for cos_i >= 0; (1, 0) at total internal
+    reflection.
 
-    `eta` is the index of refraction beyond the surface divided by the index on the incident side. Walter 2007, section
-    5.2, written for s and p polarisation.
+    `eta` is the index of refraction beyond the surface divided by the index on the incident side. The formula is that
+    of Walter 2007, section 5.2, written for s and p polarisation separately.
     """
     cos2_t = 1.0 - (1.0 - cos_i * cos_i) / (eta * eta)
     cos_t = ops.safe_sqrt(cos2_t)
@@ -82,7 +84,7 @@ def fresnel_dielectric(cos_i: Float, eta: Float) -> tuple[Float, Float]:
 def fresnel_conductor(cos_i: Float, eta: Float, k: Float) -> Float:
     """Unpolarised reflectance of a conductor with relative index eta + i k, in one channel, for cos_i >= 0.
 
-    Born and Wolf 1999, section 14.2, written in real numbers.
+    The formula is that of Born and Wolf 1999, section 14.2, without complex numbers.
     """
     cos2 = cos_i * cos_i
     sin2 = 1.0 - cos2
@@ -92,7 +94,7 @@ def fresnel_conductor(cos_i: Float, eta: Float, k: Float) -> Float:
     t1 = a2b2 + cos2
     t2 = 2.0 * cos_i * a
     r_s = (t1 - t2) / (t1 + t2)
-    t3 = cos2 * a2b2 + sin2 * sin2 + 1e-30  # 1e-30: an index of 0 + 0i reflects all light
+    t3 = cos2 * a2b2 + sin2 * sin2 + 1e-30  # avoids 0 / 0 for the index 0 + 0i, which reflects all light
     t4 = t2 * sin2
     r_p = r_s * ((t3 - t4) / (t3 + t4))
     return 0.5 * (r_s + r_p)

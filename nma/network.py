@@ -14,17 +14,17 @@ from nma import ops
 from nma.errors import NmaError
 from nma.ops import Float
 
-# A hidden layer that starts near the identity is the identity plus this factor times He's random matrix.
+# A hidden layer that starts near the identity is the identity plus this factor times the random matrix of He 2015.
 _MIXING = 0.25
 
-# Limits of a network's size. A renderer could not run such a network at every shading point.
+# The largest depth and width of a network. A renderer could not run larger networks at every shading point.
 _MOST_LAYERS, _MOST_NEURONS = 64, 1024
 
-Layers = list[tuple[Any, Any]]  # (matrix (out, in), bias (out,)) per layer
+Layers = list[tuple[Any, Any]]  # for each layer: the matrix (out, in) and the bias (out,)
 _Activation = Callable[[Float], Float]
 
-# `forward_lanes` splits a dot product into this many sums. A query of a 5x64 network took .56 us on a Zen 4 core with
-# 4 sums, and .70 us with one.
+# `forward_lanes` splits a dot product into this many sums. A query of a 5x64 network took .56 us on a Zen 4 core with 4
+# sums, and .70 us with one sum.
 _SUMS = 4
 # With AVX-512, `forward_lanes` computes the neurons in blocks of this many, whose sums fit in the 32 registers. A query
 # of a 5x64 network took .34 us on an Intel Xeon (family 6, model 167) with blocks, and .47 us without. With the 16
@@ -36,7 +36,8 @@ def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | 
     """Random layers of the given `sizes` (inputs, hidden layers, outputs), initialised as in He 2015.
 
     A layer with as many inputs as outputs starts near the identity. This makes a deep network as easy to train as a
-    shallow one. The last layer has small weights and the bias `output_bias` (outputs,), or 0.
+    shallow one. The last layer has small weights and the bias `output_bias` (outputs,), or the bias 0 if `output_bias`
+    is None.
     """
     layers: Layers = []
     for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
@@ -62,10 +63,10 @@ def forward_lanes(
 ) -> list[Float]:
     """The outputs of the network in Dr.Jit. `x` has one array per input, and the result has one array per output.
 
-    The network is unrolled into the kernel, with its weights as literals. This is the fast way inside a renderer's
-    virtual functions. There, weights in memory, as in `drjit.nn`, are gathered lane by lane on LLVM, which takes ten
-    times as long. A packet without any `active` lane skips the network and returns zeros. This helps because a renderer
-    calls the only BSDF of a scene even for rays that hit nothing.
+    The network is unrolled into the kernel, with its weights as literals. In the virtual functions of a renderer,
+    weights in memory, as in `drjit.nn`, would take ten times as long on LLVM, because they are gathered lane by lane. A
+    packet without any `active` lane skips the network and returns zeros. This saves time, because a renderer calls the
+    BSDF of a scene with only one BSDF even for rays that hit nothing.
     """
     import drjit as dr
 
@@ -97,9 +98,9 @@ def _unrolled(layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float]) -> 
 def _by_neuron(
     matrix: list[list[float]], bias: list[float], x: Sequence[Float], activation: _Activation
 ) -> list[Float]:
-    """A layer, neuron by neuron. Each dot product is split into independent sums.
+    """Computes a layer neuron by neuron, with each dot product split into independent sums.
 
-    In a single sum, every multiplication would have to wait for the previous one.
+    In a single sum, every addition would have to wait for the previous addition.
     """
     import drjit as dr
 
@@ -118,9 +119,8 @@ def _by_neuron(
 def _in_blocks(
     matrix: list[list[float]], bias: list[float], x: Sequence[Float], activation: _Activation
 ) -> list[Float]:
-    """A layer, in blocks of neurons. The sums of a block stay in registers while the inputs are added one by one.
-
-    So every input is loaded once per block. Dr.Jit may reorder operations, but it keeps the order of scopes. A new
+    """Computes a layer in blocks of neurons. The sums of a block stay in registers while the inputs are added one by
+    one, so every input is loaded once per block. Dr.Jit may reorder operations, but it keeps the order of scopes. A new
     scope for each input therefore keeps the inputs in order.
     """
     import drjit as dr

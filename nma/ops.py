@@ -1,8 +1,8 @@
 """Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written only once (CONVENTIONS.md).
 
-A function looks at the types of its arguments and calls the array package that they belong to. Plain Python numbers
-give plain Python numbers. Code that uses this module must not branch on values; it calls `select` instead. A `Vec3` is
-a triple of arrays: a direction or an RGB colour.
+A function chooses the array package by the types of its arguments. For plain Python numbers, the result is a plain
+Python number. Code that uses this module must not branch on values; it calls `select` instead. A `Vec3` is a triple of
+arrays: a direction or an RGB colour.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ INV_PI = 1.0 / math.pi
 class _Python:
     """NumPy's operations on plain Python numbers, with plain Python numbers as results.
 
-    NumPy's own scalars would take over the arithmetic with arrays of Dr.Jit or JAX.
+    NumPy scalars would not do: in `scalar * array`, NumPy's operator would convert an array of Dr.Jit or JAX.
     """
 
     __name__ = "python"
@@ -66,7 +66,8 @@ def sqrt(x: Float) -> Float:
 
 
 def safe_sqrt(x: Float) -> Float:
-    """sqrt(max(x, 0)), with the derivative 0 for x <= 0. The derivative of a plain root would be infinite at 0."""
+    """sqrt(max(x, 0)), with the derivative 0 for x <= 0. The derivative of a plain square root would be infinite at
+    0."""
     positive = x > 0
     return select(positive, sqrt(select(positive, x, 1.0)), 0.0)
 
@@ -128,7 +129,7 @@ def maximum(a: Float, b: Float) -> Float:
 
 
 def clip(x: Float, low: float, high: float) -> Float:
-    """`x`, moved to the nearer of `low` and `high` where it is outside."""
+    """`x`, limited to the range from `low` to `high`."""
     return minimum(maximum(x, low), high)
 
 
@@ -137,7 +138,7 @@ def floor(x: Float) -> Float:
 
 
 def select(condition: Mask, a: Float, b: Float) -> Float:
-    """`a` where the condition holds, else `b`. Both may be numbers or `Vec3`."""
+    """`a` where the condition holds, else `b`. `a` and `b` may be numbers or `Vec3`."""
     if isinstance(a, Vec3) or isinstance(b, Vec3):
         a, b = Vec3.of(a), Vec3.of(b)
         return Vec3(*(select(condition, p, q) for p, q in zip(a, b, strict=True)))
@@ -172,7 +173,7 @@ def lerp(a: Float, b: Float, t: Float) -> Float:
 class Vec3(NamedTuple):
     """A direction or an RGB colour: three arrays of equal shape, with elementwise arithmetic.
 
-    Dr.Jit does not look into named tuples: `dr.eval(*v)` evaluates the three arrays, `dr.eval(v)` nothing.
+    Dr.Jit does not look into named tuples: `dr.eval(*v)` evaluates the three arrays, but `dr.eval(v)` evaluates none.
     """
 
     x: Float
@@ -217,7 +218,7 @@ Color = Vec3
 
 
 def at_azimuth_0(cos_theta: Float) -> Vec3:
-    """The unit direction at azimuth 0 (y = 0, x >= 0) whose cosine to the normal is given."""
+    """The unit direction at azimuth 0 (y = 0, x >= 0) whose z, the cosine to the normal, is `cos_theta`."""
     return Vec3(safe_sqrt(1.0 - cos_theta * cos_theta), 0.0 * cos_theta, cos_theta)
 
 

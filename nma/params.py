@@ -1,4 +1,5 @@
-"""Declares the parameters of each class of materials. Sampling, inputs, textures, options and exports all use them."""
+"""Declares the parameters of each class of materials. Training, rendering, the command line and the exports read these
+declarations."""
 
 from __future__ import annotations
 
@@ -16,11 +17,11 @@ Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
 Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
 Range = Literal["training", "valid"]
 
-# A number may exceed a bound by this much, or by this share of the range if the range is narrower than 1. The reason is
-# rounding: textures and other languages keep numbers in single precision, which moves the bounds of our classes by up
-# to 1e-7.
+# A parameter may exceed a bound by this much, or by this share of the range if the range is narrower than 1. Textures
+# and other languages store parameters in single precision, whose rounding moves the bounds of our classes by up to
+# 1e-7.
 ROUNDING = 1e-6
-# What the error message advises about a number out of range.
+# The advice at the end of the error message for a parameter that is out of range.
 _ADVICE = {
     "training": ", the range that the adapter was trained on; set `clamp` to move it there",
     "valid": "; take a value in between",
@@ -37,7 +38,7 @@ class Bounds(NamedTuple):
     high: Any
 
     def bad(self, x: Any, clamp: bool = False) -> Any:
-        """Which numbers are out of range by more than `ROUNDING` or not finite; with `clamp`, which are not finite."""
+        """Whether each number is not finite or, without `clamp`, out of range by more than `ROUNDING`."""
         finite = abs(x) < np.inf
         if clamp:
             return ~finite
@@ -45,7 +46,7 @@ class Bounds(NamedTuple):
         return ~(finite & (x >= self.low - slack) & (x <= self.high + slack))
 
     def moved(self, x: Any) -> Any:
-        """The nearest numbers within the bounds, and the lower bound for NaN. The derivative on a bound is 1, not 0."""
+        """`x` clamped to the bounds; NaN becomes the lower bound. Where `x` equals a bound, the derivative is 1."""
         return ops.select(x >= self.low, ops.select(x <= self.high, x, self.high), self.low)
 
     def refusal(self, name: str, found: ArrayLike, kind: Range = "valid") -> str:
@@ -59,9 +60,10 @@ class Bounds(NamedTuple):
 class Param:
     """One parameter of a class: a number (size 1) or an RGB triple (size 3).
 
-    `law` says how training draws the parameter: "uniform"; "log10", as 10 to a uniform power; "one_minus_square", as 1
-    - U^2; or "conductor", the mixture of real metals and uniform draws described in CONVENTIONS.md. Adapters accept the
-    training range, `low` to `high`. Sources accept the physically meaningful range, `valid_low` to `valid_high`.
+    `law` names the distribution from which training draws the parameter. With "log10", its logarithm is uniform. With
+    "one_minus_square", it is 1 - U^2 for a uniform U. With "conductor", it comes from real metals or from a uniform
+    distribution (CONVENTIONS.md). Adapters accept the training range, `low` to `high`. Sources accept the physically
+    meaningful range, `valid_low` to `valid_high`.
     """
 
     name: str
@@ -82,7 +84,8 @@ class Param:
         return (x - self.low) / (self.high - self.low)
 
     def draw(self, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-        """Random values (n, size), drawn by the law. The channels of a conductor are drawn uniformly."""
+        """Random values (n, size), drawn from the parameter's law, but uniform for "conductor" (see
+        `ParamSpace.sample`)."""
         u = rng.random((n, self.size))
         if self.law == "log10":
             return 10.0 ** (np.log10(self.low) + u * np.log10(self.high / self.low))
@@ -108,7 +111,7 @@ class ParamSpace:
 
     @property
     def slices(self) -> dict[str, slice]:
-        """The columns of each parameter in a parameter vector."""
+        """For each parameter, by name, its columns in a parameter vector."""
         ends = np.cumsum([p.size for p in self.params])
         return {p.name: slice(int(e) - p.size, int(e)) for p, e in zip(self.params, ends, strict=True)}
 
@@ -121,7 +124,8 @@ class ParamSpace:
         )
 
     def vector(self, values: dict[str, ArrayLike]) -> NDArray[np.float64]:
-        """The parameter vector (size,) of named values. A single number for an RGB parameter means grey."""
+        """The parameter vector (size,) from the value of each parameter, by name. A single number for an RGB parameter
+        means grey."""
         unknown = set(values) - {p.name for p in self.params}
         missing = [p.name for p in self.params if p.name not in values]
         if unknown or missing:
@@ -137,10 +141,10 @@ class ParamSpace:
             try:
                 value = np.asarray(values[name], np.float64)
             except (TypeError, ValueError):
-                raise ParamError(f"{name} wants number(s), got {values[name]!r}") from None
+                raise ParamError(f"{name} needs numbers, got {values[name]!r}") from None
             if value.ndim > 1 or value.size not in (1, columns.stop - columns.start):
                 raise ParamError(
-                    f"{name} wants {columns.stop - columns.start} number(s), got shape {value.shape}"
+                    f"{name} needs {columns.stop - columns.start} number(s), got shape {value.shape}"
                 )
             out[columns] = value
         return out
@@ -149,8 +153,8 @@ class ParamSpace:
         """Returns `params` as float64 (n, size) within the bounds. Raises `ParamError`, which names the first bad
         value.
 
-        Values that exceed a bound by a rounding error are moved to the bound. With `clamp`, all values out of range are
-        moved. Values that are not finite are always refused.
+        Values that exceed a bound by a rounding error are replaced by the bound. With `clamp`, this applies to all
+        values out of range. Values that are not finite always raise the error.
         """
         p = np.atleast_2d(np.asarray(params, np.float64))
         if p.ndim != 2 or p.shape[1] != self.size:
@@ -174,12 +178,12 @@ class ParamSpace:
     def sample(
         self, rng: np.random.Generator, n: int, population: Population = "mixed"
     ) -> NDArray[np.float64]:
-        """Random parameter vectors (n, size), drawn by the law of each parameter.
+        """Random parameter vectors (n, size), drawn from the law of each parameter.
 
-        For classes with a conductor, `population` chooses the source of (eta, k). "range" draws every channel
-        uniformly. "metals" takes real metals, except those held out for tests. "held_out_metals" takes only the metals
-        held out. "mixed", for training, takes "range" or "metals" with equal probability. "unseen_metals", for tests,
-        takes every third material from the metals held out and the others from the other metals.
+        For classes with a conductor, `population` chooses how (eta, k) is drawn. "range" draws every channel uniformly.
+        "metals" takes real metals, except those held out for tests. "held_out_metals" takes only the metals held out.
+        "mixed", for training, takes "range" or "metals" with equal probability. "unseen_metals", for tests, takes every
+        third material from the metals held out and the others from the other metals.
         """
         if population not in get_args(Population):
             raise ParamError(
@@ -200,9 +204,9 @@ class ParamSpace:
         return out
 
 
-# The largest values that sources accept. With a larger index, Fresnel terms overflow in single precision. With a deeper
-# medium, a walk through a white medium needs about the square of the depth in steps, and the program would seem to
-# hang.
+# The largest refractive index and the largest optical depth that sources accept. With a larger index, Fresnel terms
+# overflow in single precision. In a white medium, the steps of a random walk grow with about the square of the depth,
+# so at larger depths the program would seem to hang.
 _MAX_INDEX, _MAX_DEPTH = 1e4, 1e3
 
 LAYERED3 = ParamSpace(
@@ -257,10 +261,11 @@ LAYERED3 = ParamSpace(
     ),
 )
 
-# A single material that has only values and no parameters: measured, tabulated, or a BSDF of another program.
+# The class of materials that have no parameters, only BRDF values: measured, tabulated, or from another program's BSDF.
 MEASURED = ParamSpace("measured", ())
 
-# A material of a library (`nma.adapter.library`), given by its learned code. A single number of a code has no meaning.
+# The class of the materials of a library (`nma.adapter.library`). Its only parameter is the learned code of a material,
+# whose single numbers have no meaning.
 CODE_BOUND = 4.0
 LIBRARY = ParamSpace(
     "library",

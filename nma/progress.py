@@ -69,10 +69,8 @@ class TrainingBar:
 def of_training(
     given: Callable[[Any], None] | None, recipe: Any, title: str = "training"
 ) -> Iterator[Callable[[Any], None]]:
-    """Yields the function that training calls with its progress.
-
-    This is `given`, if there is one. Otherwise the function updates a progress bar if stderr is a terminal, and does
-    nothing if it is not.
+    """Yields the function that training calls to report its progress. The function is `given`, unless `given` is None.
+    Without `given`, the function updates a progress bar if stderr is a terminal, and otherwise does nothing.
     """
     if given is not None:
         yield given

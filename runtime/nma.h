@@ -207,8 +207,8 @@ private:
     void check_description() const {
         if (anisotropic() && (in_plane_ || !weights_.directional))
             throw Error(
-                "it is anisotropic, but its target holds in the plane of incidence, or it ignores the direction; train "
-                "again");
+                "it is anisotropic, but its lobes stretch along the plane of incidence, or its network does not read "
+                "the view direction; train again");
         if (weights_.dialect != DIALECT)
             throw Error("it was written for the Principled dialect '" + weights_.dialect +
                         "', this version evaluates '" + DIALECT + "'");

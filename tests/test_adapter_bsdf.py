@@ -352,8 +352,8 @@ def test_clamp_moves_inputs_to_the_training_range(weights):
         ({"adapter": "layered9-1x1"}, "layered9-1x1"),
         ({"adapter": "nowhere.safetensors"}, "nowhere.safetensors: no such weights file"),
         ({"adapter": 3}, "adapter"),
-        ({"material": 3}, "material wants a name (string), got 3"),
-        ({"clamp": "false"}, "clamp wants true or false (boolean), got 'false'"),
+        ({"material": 3}, "material needs a name (string), got 3"),
+        ({"clamp": "false"}, "clamp needs true or false (boolean), got 'false'"),
     ),
 )
 def test_wrong_inputs_are_refused(weights, changes, message):

@@ -97,7 +97,7 @@ def test_an_error_of_several_lines_becomes_one_line(tmp_path):
     )
     with pytest.raises(nma.render.load.SceneError) as error:
         load_scene(tmp_path / "scene.xml")
-    assert "alpha_top wants" in str(error.value) and "RoughConductor[" in str(error.value)
+    assert "alpha_top needs" in str(error.value) and "RoughConductor[" in str(error.value)
     assert "\n" not in str(error.value)
 
 

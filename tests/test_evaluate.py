@@ -233,7 +233,7 @@ def test_an_adapter_of_one_material_is_not_compared_with_another():
     fitted = constant(BLENDS["alpha .1"])
     fitted.training.update(params=PARAMS[1].tolist(), material="gold-red-lacquer")
     assert tabulate_adapter(fitted, PARAMS[1].astype(np.float32)[None]).shape[0] == 1
-    with pytest.raises(ParamError, match="knows a single material, gold-red-lacquer"):
+    with pytest.raises(ParamError, match="was trained for a single material, gold-red-lacquer"):
         tabulate_adapter(fitted, PARAMS[:1])
 
 

@@ -180,7 +180,7 @@ def test_the_runtime_in_cpp_reads_a_library(compiler, library, saved):
 def test_errors_name_the_mistake(library, saved, tmp_path):
     for call, words in (
         (lambda: library.code("rde"), "no material 'rde'.*did you mean 'red'"),
-        (lambda: library.mix(["red", "blue"], [1]), "2 materials need as many weights"),
+        (lambda: library.mix(["red", "blue"], [1]), "2 materials need 2 weights"),
         (lambda: library.mix(["red", "blue"], [1, -1]), "of at least 0"),
         (lambda: library.mix(["red"], [0]), "all 0"),
         (lambda: library.material(np.full(32, 9.0)), "code.*allowed is -4 .. 4"),
@@ -199,7 +199,7 @@ def test_errors_name_the_mistake(library, saved, tmp_path):
     replace(library.adapter, training=odd).save(plain, {"codes": library.codes})
     with pytest.raises(WeightsError, match="plain.safetensors.*not a library"):
         Library.load(plain)
-    with pytest.raises(WeightsError, match="a name is there twice"):
+    with pytest.raises(WeightsError, match="a name occurs twice"):
         Library(library.adapter, ("a", "a", "b"), library.codes)
     with pytest.raises(WeightsError, match="class layered3"):
         Library(replace(library.adapter, space=LAYERED3), NAMES, library.codes)

@@ -306,7 +306,7 @@ def test_any_isotropic_material_is_written_by_a_command(
         (["none.npz"], "no such file"),
         (["class.safetensors"], "class: an adapter of the whole class layered3; name a material"),
         (["gold-red-laquer"], "did you mean 'gold-red-lacquer'"),
-        (["wet-nickel", "--adapter", "single.safetensors"], "knows a single material"),
+        (["wet-nickel", "--adapter", "single.safetensors"], "was trained for a single material"),
     ],
 )
 def test_what_has_no_values_for_a_merl_file_is_one_line(

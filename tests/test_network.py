@@ -102,7 +102,7 @@ def test_encodings_agree_on_all_array_packages():
 
 
 def test_an_unknown_encoding_is_refused():
-    with pytest.raises(WeightsError, match="unknown input encoding 'fourier'; this version knows raw"):
+    with pytest.raises(WeightsError, match="unknown input encoding 'fourier'; this version has raw"):
         encoding.get("fourier")
 
 

@@ -183,10 +183,10 @@ def test_a_vector_is_built_from_names():
     np.testing.assert_allclose(vector, [0.1, 0.2, 1.5, 0.2, 0.9, 1.1, 3.9, 2.4, 2.2, 0.5, 0.5, 0.5, 1.0])
     for change, message in (
         ({"gloss": 1.0}, "unknown parameter 'gloss'"),
-        ({"albedo": (0.1, 0.2)}, r"albedo wants 3 number\(s\), got shape \(2,\)"),
-        ({"sigma_t": (0.1, 0.2, 0.3)}, r"sigma_t wants 1 number\(s\)"),
-        ({"sigma_t": "thick"}, "sigma_t wants number.*'thick'"),
-        ({"albedo": [[0.5]]}, "albedo wants 3"),
+        ({"albedo": (0.1, 0.2)}, r"albedo needs 3 number\(s\), got shape \(2,\)"),
+        ({"sigma_t": (0.1, 0.2, 0.3)}, r"sigma_t needs 1 number\(s\)"),
+        ({"sigma_t": "thick"}, "sigma_t needs number.*'thick'"),
+        ({"albedo": [[0.5]]}, "albedo needs 3"),
     ):
         with pytest.raises(ParamError, match=message):
             LAYERED3.vector(values | change)

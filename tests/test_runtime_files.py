@@ -108,8 +108,11 @@ def nested(depth):
         (changed("layered3-3x32", hidden="many"), "'hidden'"),
         (changed("layered3-3x32", target=[]), "does not fit its description"),
         (changed("layered3-3x32", encoding="azimuth"), "does not fit its description"),
-        (changed("layered3-3x32", encoding="azimuth", target=[IN_PLANE]), "holds in the plane of incidence"),
-        (changed("layered3-3x32", encoding="azimuth", directional=False), "ignores the direction"),
+        (
+            changed("layered3-3x32", encoding="azimuth", target=[IN_PLANE]),
+            "lobes stretch along the plane of incidence",
+        ),
+        (changed("layered3-3x32", encoding="azimuth", directional=False), "does not read the view direction"),
     ],
 )
 def test_inconsistent_files_are_refused(tmp_path, data, message):
@@ -192,7 +195,7 @@ def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
     other = own * np.where(np.arange(13) == 9, 1.001, 1)
     for clamp in (False, True):
         with pytest.raises(
-            ParamError, match="albedo of row 0 is .*, but the adapter knows a single material"
+            ParamError, match="albedo of row 0 is .*, but the adapter was trained for a single material"
         ):
             runtime.prepare(other, mu, clamp=clamp)
     for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13):

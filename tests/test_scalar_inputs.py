@@ -254,7 +254,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
         ({"sigma_t_channel": "g"}, "sigma_t_channel chooses a channel of a texture"),
         ({"albedo_channel": "g"}, "albedo_channel chooses a channel of a texture"),
         ({"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo: albedo is 1.5, allowed"),
-        ({"sigma_t": COLOUR}, "sigma_t wants one number or a texture, got the colour 0.1, 0.5, 0.9"),
+        ({"sigma_t": COLOUR}, "sigma_t needs one number or a texture, got the colour 0.1, 0.5, 0.9"),
         ({"sigma_t": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}, None),
         ({"albedo": [0.1, 0.5, 0.9]}, None),
         ({"albedo": [0.1, 1.5, 0.9]}, "albedo is 0.1, 1.5, 0.9, allowed is 0 .. 1"),
@@ -268,7 +268,10 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
         ({"sigma_t": bitmap(7.0), "type": "layered"}, None),
         ({"adapter": one, "sigma_t": 0.5}, None),
         ({"adapter": one, **dict.fromkeys(MATERIAL)}, None),
-        ({"adapter": one, "sigma_t": 0.6}, "knows a single material, whose sigma_t is 0.5, not 0.6"),
+        (
+            {"adapter": one, "sigma_t": 0.6},
+            "was trained for a single material, whose sigma_t is 0.5, not 0.6",
+        ),
         ({"adapter": one, "sigma_t": bitmap(0.5)}, "so that no texture can drive sigma_t"),
         (
             {"eta_top": png(tmp_path, False)},

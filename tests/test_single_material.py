@@ -57,7 +57,7 @@ def test_only_the_recorded_material_is_accepted_up_to_rounding(weights):
     other = vector.copy()
     other[9] *= 1.001
     with pytest.raises(
-        ParamError, match="knows .*gold-red-lacquer, whose albedo is 0.95, 0.08, 0.03, not 0.95095, "
+        ParamError, match="trained for .*gold-red-lacquer, whose albedo is 0.95, 0.08, 0.03, not 0.95095, "
     ):
         adapter.check(np.stack([vector, other]))
 
@@ -76,7 +76,7 @@ def test_the_source_of_an_adapter_needs_no_parameters(weights):
     own = numbers(AdapterValues(adapter).eval(*wo_wi))
     assert own.max() > 0
     np.testing.assert_array_equal(own, numbers(AdapterValues(adapter, GOLD.vector()).eval(*wo_wi)))
-    with pytest.raises(ParamError, match="knows a single material"):
+    with pytest.raises(ParamError, match="was trained for a single material"):
         AdapterValues(adapter, materials.load("wet-nickel").vector())
 
 
@@ -96,7 +96,7 @@ def test_the_bsdf_needs_no_parameters_and_accepts_the_recorded_ones(weights, giv
     [
         (
             {"material": "wet-nickel"},
-            "knows a single material, gold-red-lacquer, whose alpha_top is 0.005, not 0.001",
+            "was trained for a single material, gold-red-lacquer, whose alpha_top is 0.005, not 0.001",
         ),
         ({"material": "gold-red-lacquer", "sigma_t": 0.5}, "whose sigma_t is 0.6, not 0.5"),
         (
@@ -127,7 +127,7 @@ def test_nma_render_shows_an_adapter_alone_and_refuses_another_material(nma, wei
     np.testing.assert_array_equal(read_image(tmp_path / "1.exr"), read_image(tmp_path / "3.exr"))
     code, _, err = nma("render", "wet-nickel", "--adapter", weights, "-o", tmp_path / "no.exr", *options)
     assert code == 1 and err.count("\n") == 1
-    assert "knows a single material, gold-red-lacquer" in err
+    assert "was trained for a single material, gold-red-lacquer" in err
     assert not (tmp_path / "no.exr").exists()
 
 

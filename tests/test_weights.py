@@ -162,7 +162,7 @@ HEADERS = {
     "another format": (lambda h: _with(h, format=2), "format 2, this version reads 1; upgrade"),
     "another class": (
         lambda h: _with(h, class_name="velvet"),
-        "class 'velvet'; this version knows layered3",
+        "class 'velvet'; this version has layered3",
     ),
     "other parameters": (lambda h: _parameters(h, 1, name="gloss"), "differs .* parameter 1, alpha_bottom"),
     "another range": (lambda h: _parameters(h, 6, high=2.0), "differs .* parameter 6, sigma_t"),
@@ -176,7 +176,7 @@ HEADERS = {
         lambda h: _with(h, directional=False, reciprocal=True),
         r"maps \d+ inputs to 23 .*says",
     ),
-    "other instances": (lambda h: _with(h, instances=3), "23 outputs, its description says .* to 35"),
+    "other instances": (lambda h: _with(h, instances=3), "23 outputs, but its description says .* to 35"),
     "no instances": (lambda h: _with(h, instances=0), "blend of 0 instances"),
     "other hidden layers": (lambda h: _with(h, hidden=[32, 32, 64]), r"not the \[32, 32, 64\]"),
     "more hidden layers": (lambda h: _with(h, hidden=[32] * 4), "'layer4.weight' is missing"),

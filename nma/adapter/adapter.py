@@ -1,4 +1,4 @@
-"""The adapter: (parameters of a source material, wi) -> parameters of the analytic target, paper eq. 4."""
+"""The adapter maps the parameters of a source material and `wi` to those of the analytic target (paper eq. 4)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
-# Parameters with a smaller relative difference are of the same material: they differ by rounding to single precision.
+# Parameters whose relative difference is smaller count as equal, because single precision may round them differently.
 SAME = 1e-5
 
 
@@ -47,7 +47,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def weights_file(name_or_path: str | Path) -> Path:
-    """The file of the shipped adapter with this name; for any other name, the name as a path."""
+    """The path of the weights file of a shipped adapter. A name that no shipped adapter has is itself a path."""
     if str(name_or_path) in shipped():
         return Path(str(_SHIPPED.joinpath(f"{name_or_path}.safetensors")))
     return Path(name_or_path)
@@ -55,9 +55,9 @@ def weights_file(name_or_path: str | Path) -> Path:
 
 @dataclass(frozen=True)
 class Adapter:
-    """A trained network, with everything that is needed to apply it. `Adapter.load` reads a file; `prepare` applies it.
+    """A trained network with its encoding and its target. `Adapter.load` reads a file, and `prepare` runs the network.
 
-    With `bounded`, blends are dimmed where they might reflect more light than they receive (`nma.target.bounded`).
+    With `bounded`, the blend is dimmed where it might reflect more light than it receives (`nma.target.bounded`).
     """
 
     space: ParamSpace
@@ -97,7 +97,7 @@ class Adapter:
         return adapter
 
     def save(self, path: str | Path, more: Mapping[str, NDArray] | None = None) -> None:
-        """Writes a weights file, atomically. `more` are further tensors to store with the network's."""
+        """Writes a weights file, atomically. `more` has further tensors to store beside those of the network."""
         header = weights.Header(
             class_name=self.space.name,
             parameters=weights.describe(self.space),
@@ -115,14 +115,15 @@ class Adapter:
 
     @property
     def variant(self) -> str:
-        """The paper's name: single, omega_i, blended, or blended + omega_i."""
+        """The paper's name for this kind of adapter: single, omega_i, blended, or blended + omega_i."""
         names = ["blended"] if self.instances > 1 else []
         names += ["omega_i"] if self.directional else []
         return " + ".join(names) or "single"
 
     @property
     def reciprocal(self) -> bool:
-        """Whether swapping wi and wo does not change f. This holds if the target's parameters do not depend on wi."""
+        """Whether f stays the same when wi and wo are swapped, that is, whether the target's parameters do not depend
+        on wi."""
         return not (self.directional or self.bounded)
 
     @property
@@ -137,14 +138,13 @@ class Adapter:
 
     @property
     def in_plane(self) -> bool:
-        """Whether lobes stretch along the plane of incidence (`nma.target.Plane`)."""
+        """Whether the lobes of the target are stretched along the plane of incidence (`nma.target.Plane`)."""
         return any(p.in_plane for p in self.target)
 
     @property
     def material(self) -> NDArray[np.float64] | None:
-        """The parameters of the only material for which the adapter was trained, in the order of its class.
-
-        It is None if the adapter was trained for a whole class, or if its class has no parameters.
+        """The parameters of the only material for which the adapter was trained, in the order of the material's class.
+        The result is None if the adapter was trained for a whole class, or if its class has no parameters.
         """
         fitted = self.training.get("params")
         if not self.space.size or self.encoding not in encoding.SINGLE or fitted is None:
@@ -152,10 +152,11 @@ class Adapter:
         return np.asarray(fitted, np.float64)
 
     def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
-        """Returns `params` as float64 (n, columns) if the adapter was trained for these materials.
+        """Returns the parameters `params` of n materials as float64 (n, columns).
 
-        An adapter of a class accepts parameters within the training range, and with `clamp` moves others to that range.
-        An adapter of a single material accepts only the parameters of this material. Raises `ParamError` for others.
+        An adapter of a class accepts parameters within the training range; with `clamp`, it moves other parameters to
+        that range. An adapter of a single material accepts only the parameters of this material. Raises `ParamError`
+        for parameters that are not accepted.
         """
         known = self.material
         if known is None:
@@ -167,9 +168,9 @@ class Adapter:
             other = ~np.isclose(given[:, columns], known[columns], rtol=SAME).all(axis=1)
             if other.any():
                 raise ParamError(
-                    f"the adapter knows a single material, {self.training.get('material', 'that of its fit')}, whose "
-                    f"{name} is {_plain(known[columns])}, not {_plain(given[other][0, columns])}; fit one to that "
-                    "material, or take the adapter of a class"
+                    f"the adapter was trained for a single material, {self.training.get('material', 'unnamed')}, whose "
+                    f"{name} is {_plain(known[columns])}, not {_plain(given[other][0, columns])}; fit another adapter "
+                    "to your material, or use an adapter of its class"
                 )
         return given
 
@@ -181,7 +182,7 @@ class Adapter:
         """
         try:
             wi.z  # noqa: B018
-        except (AttributeError, RuntimeError):  # Dr.Jit's arrays raise the latter
+        except (AttributeError, RuntimeError):  # Dr.Jit's arrays raise RuntimeError
             raise ParamError(
                 "prepare takes the view direction wi as an nma.ops.Vec3, not a cosine; "
                 "nma.ops.at_azimuth_0(cos_theta_i) makes one"
@@ -195,11 +196,12 @@ class Adapter:
         return self.decode(raw, wi)
 
     def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF that the network's raw outputs describe, seen from `wi`."""
+        """The BRDF for the view direction `wi` from the raw outputs of the network."""
         return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
 
     def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF, seen from `wi`, of the numbers that `numbers` returns; `flat` has one array for each number."""
+        """The BRDF for the view direction `wi` from the target's parameters: `flat` has one array for each column of
+        `numbers`."""
         return self._framed(from_numbers(flat, self.target), wi)
 
     def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
@@ -207,7 +209,7 @@ class Adapter:
         return Brdf(blend, Plane.of(wi) if self.in_plane else None)
 
     def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
-        """The target's parameters (m, n, size) of m materials (m, columns) at n cosines (n,).
+        """The target's parameters (m, n, size) for m materials (m, columns) and n values of cos(theta_i) (n,).
 
         Raises `ParamError` for anisotropic adapters.
         """
@@ -223,8 +225,8 @@ class Adapter:
         """Raises `ParamError` if the adapter needs more of the view direction than cos(theta_i)."""
         if self.anisotropic:
             raise ParamError(
-                "an anisotropic adapter has no curves over cos(theta_i), as the azimuth of the view matters; "
-                "call `prepare` with whole directions"
+                "an anisotropic adapter has no curves over cos(theta_i), because its BRDF also depends on the azimuth "
+                "of the view direction; call `prepare` instead"
             )
 
     def _check(self, path: Path, dialect: str) -> None:
@@ -232,33 +234,34 @@ class Adapter:
         self._check_material(path)
         if dialect != DIALECT:
             raise WeightsError(
-                f"{path}: it is for the Principled dialect '{dialect}', but this version has '{DIALECT}'"
+                f"{path}: the adapter uses the Principled dialect '{dialect}', but this version has '{DIALECT}'"
             )
         if self.instances < 1:
-            raise WeightsError(f"{path}: a blend of {self.instances} instances; train again")
+            raise WeightsError(f"{path}: its blend of {self.instances} instances is empty; train again")
         if self.anisotropic and (self.in_plane or not self.directional):
             raise WeightsError(
-                f"{path}: an anisotropic adapter whose target holds in the plane of incidence, or ignores the "
-                "direction; train again"
+                f"{path}: it is anisotropic, but its lobes stretch along the plane of incidence, or its network does "
+                "not read the view direction; train again"
             )
         if self.in_plane and not self.directional:
             raise WeightsError(
-                f"{path}: lobes stretch in the plane of incidence, but the network gets no direction; train again"
+                f"{path}: its lobes stretch along the plane of incidence, but its network does not read the view "
+                "direction; train again"
             )
         inputs = encoding.size(self.encoding, self.space, self.directional)
         found = self.layers[0][0].shape[1], self.layers[-1][0].shape[0]
         if found != (inputs, self.size):
             raise WeightsError(
                 f"{path}: the network maps {found[0]} inputs to {found[1]} outputs, "
-                f"its description says {inputs} to {self.size}; train again"
+                f"but its description says {inputs} to {self.size}; train again"
             )
 
     def _check_material(self, path: Path) -> None:
-        """Raises `WeightsError` if the recorded parameters of the only material are not valid for the class."""
+        """Raises `WeightsError` if the file records a single material whose parameters are not valid for the class."""
         try:
             known = self.material
             if known is not None and self.space.check(known).shape[1:] != known.shape:
-                raise ParamError(f"shape {known.shape}")
+                raise ParamError(f"its parameters have the shape {known.shape}")
         except (ValueError, TypeError) as e:
             raise WeightsError(
                 f"{path}: its material does not fit the class {self.space.name} ({e}); fit it again"

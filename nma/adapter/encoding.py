@@ -1,6 +1,6 @@
 """Encodings of the network's inputs: a class's parameters and the view direction as numbers of about unit size.
 
-They are written with `nma.ops`, so that training and rendering share them. Weights files store the name of the
+Encodings are written with `nma.ops`, so training and rendering run the same code. Weights files store the name of the
 encoding.
 """
 
@@ -15,12 +15,12 @@ from nma.ops import Float, Vec3
 from nma.params import LAYERED3, ParamSpace
 
 # An encoder takes one array per parameter column and the view direction, which is None for adapters that ignore it.
-# Isotropic encodings use only its z, which is cos(theta_i).
+# Isotropic encodings use only wi.z, which is cos(theta_i).
 Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
 # Cosine of 84 degrees, near the dip of metals' reflectance before it rises to 1.
 GRAZING = 0.1045
-# Smaller cosines of refraction are replaced by this one.
+# Where the cosine of the refracted direction is smaller than this value, this value replaces it.
 MIN_COS_T = 0.05
 
 
@@ -35,13 +35,11 @@ def direction(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
 
 
 def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
-    """The whole direction, for one anisotropic material: its cosine, and cosine and sine of its azimuth and of twice
-    that.
-
-    All except the cosine go to 0 at normal incidence, where there is no azimuth.
+    """The whole direction, for one anisotropic material: wi.z, and the cosine and sine of the azimuth and of its
+    double. Factors make the cosines and sines 0 at normal incidence, where the azimuth is not defined.
     """
     if wi is None:
-        raise ParamError("the encoding 'azimuth' reads the view direction; set `directional` in the recipe")
+        raise ParamError("the encoding 'azimuth' needs the view direction; set `directional` in the recipe")
     x, y, z = wi
     return [2.0 * z - 1.0, x, y, x * x - y * y, 2.0 * x * y]
 
@@ -49,9 +47,10 @@ def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
 def layered3(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """Physical quantities of a coated conductor, all scaled to [-1, 1].
 
-    They are the logarithms of the widths; the coat's index and the medium's depth; the conductor's reflectance inside
-    the coat, at normal incidence and at 84 degrees; the medium's albedo; cos(theta_i); the coat's Fresnel reflectance
-    at wi; and the medium's transmittance along the refracted direction.
+    The quantities are the coat's refractive index, the medium's optical depth and albedo, the conductor's reflectance
+    inside the coat at normal incidence and at 84 degrees, and the logarithm of each microfacet width. With the view
+    direction, there are also cos(theta_i), the coat's Fresnel reflectance at wi, and the medium's transmittance along
+    the refracted direction.
     """
     alpha_top, alpha_bottom, eta_top, *rest = columns
     eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
@@ -77,7 +76,8 @@ ENCODERS: dict[str, Encoder] = {
     "azimuth": azimuth,
     "layered3": layered3,
 }
-# Encodings for a single material, which use only the direction, and encodings that depend on the azimuth.
+# SINGLE has the encodings for a single material, which use only the direction. The encodings in ANISOTROPIC depend on
+# the azimuth of the direction.
 SINGLE = ("direction", "azimuth")
 ANISOTROPIC = ("azimuth",)
 
@@ -86,11 +86,11 @@ def get(name: str) -> Encoder:
     """The encoder with this name. Raises `WeightsError` if this version has no such encoder."""
     if name not in ENCODERS:
         raise WeightsError(
-            f"unknown input encoding '{name}'; this version knows {', '.join(ENCODERS)}: upgrade the package"
+            f"unknown input encoding '{name}'; this version has {', '.join(ENCODERS)}; upgrade the package"
         )
     return ENCODERS[name]
 
 
 def size(name: str, space: ParamSpace, directional: bool) -> int:
-    """The number of network inputs of an encoding for a class, with or without the direction."""
+    """How many inputs a network of this class and encoding has, with or without the view direction."""
     return len(get(name)([0.5] * space.size, ops.at_azimuth_0(0.5) if directional else None))

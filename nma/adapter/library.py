@@ -1,7 +1,8 @@
-"""A library: many materials in one small network, each a point of its latent space (paper Fig. 12).
+"""A library: many materials in one small network, where each material is a point in a latent space (paper Fig. 12).
 
-A library is an adapter of the class `library`, whose only parameter is the `code` of a material. With it come the codes
-and names of the materials on which it was trained. Codes can be mixed, and a code can be learned for a new material.
+A library is an adapter of the class `library`, whose only parameter is the `code` of a material. The library also
+stores the names and codes of the materials on which it was trained. Codes can be mixed, and a code for a new material
+can be found by training.
 
     library = Library.load("library.safetensors")
     code = library.mix(["gold-metallic-paint", "blue-rubber"], [0.7, 0.3])
@@ -39,12 +40,12 @@ class Library:
         shape = (len(self.names), LIBRARY.size)
         if self.adapter.space != LIBRARY or self.adapter.encoding != "raw":
             raise WeightsError(
-                f"a library's adapter takes the code of class {LIBRARY.name} as it is; this one is for class "
-                f"{self.adapter.space.name}, encoding {self.adapter.encoding}"
+                f"a library needs an adapter of class {LIBRARY.name} with encoding raw; the given adapter has class "
+                f"{self.adapter.space.name} and encoding {self.adapter.encoding}"
             )
         if not self.names or len(set(self.names)) < len(self.names) or self.codes.shape != shape:
             raise WeightsError(
-                f"{len(self.names)} names and codes {self.codes.shape} do not belong together, or a name is there twice"
+                f"{len(self.names)} names do not match codes of shape {self.codes.shape}, or a name occurs twice"
             )
 
     @staticmethod
@@ -75,7 +76,7 @@ class Library:
 
     @property
     def parameters(self) -> int:
-        """How many numbers were trained: codes and network."""
+        """How many values were trained: those of the codes and the network's weights and biases."""
         return self.codes.size + network.parameters(self.adapter.layers)
 
     def code(self, name: str) -> NDArray[np.float32]:
@@ -91,7 +92,7 @@ class Library:
         shares = np.asarray(weights, np.float64)
         if shares.shape != (len(names),) or not (np.isfinite(shares).all() and (shares >= 0).all()):
             raise ParamError(
-                f"{len(names)} materials need as many weights of at least 0, got {shares.tolist()}"
+                f"{len(names)} materials need {len(names)} weights of at least 0, got {shares.tolist()}"
             )
         if not shares.sum() > 0:
             raise ParamError("the weights of a mixture are all 0; make one of them positive")
@@ -99,11 +100,11 @@ class Library:
         return (shares / shares.sum() @ codes).astype(np.float32)
 
     def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
-        """The material of a code as an ordinary adapter, whose only input is the direction: the code goes into the
-        biases."""
+        """The material of a code as an adapter of that one material. The result reads only cos(theta_i): what the code
+        adds to the sums of the first layer is put into the biases."""
         code = LIBRARY.check(code)
         if len(code) != 1:
-            raise ParamError(f"one code makes one material; got {len(code)}")
+            raise ParamError(f"`material` takes one code; got {len(code)} codes")
         (matrix, bias), *rest = self.adapter.layers
         bias = bias + matrix[:, : LIBRARY.size] @ code[0]
         if self.adapter.directional:
@@ -122,6 +123,6 @@ class Library:
     def add(self, name: str, code: ArrayLike) -> Library:
         """A copy of the library with one more material. Raises `ParamError` if the name is taken."""
         if name in self.names:
-            raise ParamError(f"the library has a material '{name}'; choose another name")
+            raise ParamError(f"the library already has a material '{name}'; choose another name")
         codes = np.concatenate([self.codes, LIBRARY.check(code).astype(np.float32)])
         return replace(self, names=(*self.names, name), codes=codes)

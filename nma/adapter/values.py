@@ -1,4 +1,4 @@
-"""One material of an adapter as a source, so that it can be compared and tabulated like any other."""
+"""One material of an adapter as a source, so that the material can be compared and tabulated like measured ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nma.ops import Color, Vec3
 
 
 class AdapterValues:
-    """One material of an adapter, as a source of values (`Values`).
+    """One material of an adapter, as a source of BRDF values (the protocol `Values`).
 
     `params` are the parameters of the material; an adapter of a single material does not need them. Raises `ParamError`
     for parameters for which the adapter was not trained.
@@ -30,5 +30,5 @@ class AdapterValues:
         self.isotropic = not adapter.anisotropic
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
-        """f cos(theta_o) [1/sr]."""
+        """The value f cos(theta_o) [1/sr] of the material's BRDF."""
         return self.adapter.prepare([wi.z * 0.0 + p for p in self.params], wi).eval(wi, wo)

@@ -1,8 +1,8 @@
-"""Reads and writes weights files: safetensors files, whose header has all settings of the network as JSON.
+"""Reads and writes weights files. These are safetensors files whose header describes the network in JSON.
 
-The tensors are float32: `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight` and so on. A library
-(`nma.adapter.library`) also has its codes. The header's metadata has one entry, `nma`: a JSON object with the fields of
-`Header`.
+The tensors are float32: `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight` and so on. The file of a
+library (`nma.adapter.library`) also has the tensor `codes`. The metadata in the header has one entry, `nma`: a JSON
+object with the fields of `Header`.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ MAX_DEPTH = 32
 class Header:
     """The metadata of a weights file.
 
-    `parameters` repeats the declaration of the class, so that programs in other languages need no Python. `reciprocal`
-    is true if the target does not depend on the view direction. `target` lists the target's parameters with their
-    ranges. `dialect` names the version of the Principled BRDF. `bounded` says whether the target is dimmed where it
-    might reflect more light than it receives. `training` records how the weights were made.
+    `parameters` repeats the declaration of the class, so that programs in other languages do not need this package.
+    `reciprocal` is true if the target does not depend on the view direction. `target` lists the target's parameters
+    with their ranges. `dialect` names the version of the Principled BRDF. `bounded` says whether the target is dimmed
+    where it might reflect more light than it receives. `training` records how the weights were made.
     """
 
     class_name: str
@@ -54,7 +54,7 @@ class Header:
 
 
 def describe(space: ParamSpace) -> list[dict[str, Any]]:
-    """The declaration of a class as JSON data; infinite bounds become null."""
+    """The parameters of a class, with their ranges, as JSON data. Infinite bounds become null."""
     rows = [asdict(p) for p in space.params]
     return [{k: None if v in (float("inf"), float("-inf")) else v for k, v in row.items()} for row in rows]
 
@@ -62,7 +62,7 @@ def describe(space: ParamSpace) -> list[dict[str, Any]]:
 def write(
     path: str | Path, header: Header, layers: Layers, more: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Writes a weights file, atomically. `more` are further tensors to store with the layers."""
+    """Writes a weights file, atomically. `more` has further tensors to store beside those of the layers."""
     tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in (more or {}).items()}
     for number, (matrix, bias) in enumerate(layers):
         tensors[f"layer{number}.weight"] = np.ascontiguousarray(matrix, np.float32)
@@ -85,7 +85,9 @@ def read(path: str | Path) -> tuple[Header, Layers]:
             f"{path}: truncated, or not a safetensors file ({e}); copy or train it again"
         ) from None
     if "nma" not in metadata:
-        raise WeightsError(f"{path}: a safetensors file without NMA metadata; `nma train` writes adapters")
+        raise WeightsError(
+            f"{path}: a safetensors file without NMA metadata, so it is no adapter; `nma train` writes adapters"
+        )
     _check_types(path, types)
     header = _header(path, metadata["nma"])
     _check_class(path, header)
@@ -97,15 +99,16 @@ def _check_types(path: Path, types: Mapping[str, str]) -> None:
     for name, kind in types.items():
         if kind != "F32":
             raise WeightsError(
-                f"{path}: tensor '{name}' holds numbers of type {kind}, weights are F32; convert or train it again"
+                f"{path}: tensor '{name}' holds numbers of type {kind}, but this package reads only F32; convert the "
+                "file, or train again"
             )
 
 
 def _header(path: Path, text: str) -> Header:
-    """The header from its JSON text, after a check of the type of each field."""
+    """Parses the JSON text of the header and checks the type of each field."""
     if _depth(text) > MAX_DEPTH:
         raise WeightsError(
-            f"{path}: its metadata nests {_depth(text)} deep, at most {MAX_DEPTH} is read; copy or train it again"
+            f"{path}: its metadata nests {_depth(text)} deep, at most {MAX_DEPTH} is allowed; train again"
         )
     try:
         header = Header(**json.loads(text))
@@ -116,7 +119,7 @@ def _header(path: Path, text: str) -> Header:
     for name, hint in get_type_hints(Header).items():
         if not isinstance(getattr(header, name), get_origin(hint) or hint):
             raise WeightsError(
-                f"{path}: its metadata has a '{name}' of the wrong type, {getattr(header, name)!r}; train it again"
+                f"{path}: its metadata has a '{name}' of the wrong type, {getattr(header, name)!r}; train again"
             )
     return header
 
@@ -131,7 +134,8 @@ def _depth(text: str) -> int:
 
 
 def _check_class(path: Path, header: Header) -> None:
-    """Raises `WeightsError` for a format or class that this version does not have, or that it declares differently."""
+    """Raises `WeightsError` if this version does not have the file's format or class, or has another class of that
+    name."""
     if header.format != FORMAT:
         raise WeightsError(
             f"{path}: format {header.format}, this version reads {FORMAT}; upgrade the package"
@@ -139,7 +143,7 @@ def _check_class(path: Path, header: Header) -> None:
     space = SPACES.get(header.class_name)
     if space is None:
         raise WeightsError(
-            f"{path}: made for class '{header.class_name}'; this version knows {', '.join(SPACES)}"
+            f"{path}: made for class '{header.class_name}'; this version has {', '.join(SPACES)}"
         )
     keys = ("name", "size", "law", "low", "high")
     for number, declared in enumerate(describe(space)):
@@ -147,7 +151,7 @@ def _check_class(path: Path, header: Header) -> None:
         if not isinstance(theirs, dict) or any(theirs.get(k) != declared[k] for k in keys):
             raise WeightsError(
                 f"{path}: its class '{header.class_name}' differs from this version's in parameter {number}, "
-                f"{declared['name']}; use the version that wrote it, or train again"
+                f"{declared['name']}; use the version that wrote the file, or train again"
             )
     if len(header.parameters) > len(space.params):
         raise WeightsError(

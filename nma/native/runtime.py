@@ -162,8 +162,8 @@ class Runtime:
             if other.any():
                 row, column = np.argwhere(other)[0]
                 raise ParamError(
-                    f"{self.names[column]} of row {row} is {rows[row, column]:g}, but the adapter knows a single "
-                    f"material, whose {self.names[column]} is {self.material[column]:g}; "
+                    f"{self.names[column]} of row {row} is {rows[row, column]:g}, but the adapter was trained "
+                    f"for a single material, whose {self.names[column]} is {self.material[column]:g}; "
                     "fit another adapter to the new material"
                 )
             return rows

@@ -32,7 +32,7 @@ def check_numbers(allowed: Allowed, value: Any) -> None:
     numbers = _plain(value).ravel()
     name, size = allowed.param.name, allowed.param.size
     if numbers.size not in (1, size):
-        raise ParamError(f"{name} wants {size} number(s), got {numbers.size}")
+        raise ParamError(f"{name} needs {size} number(s), got {numbers.size}")
     if allowed.bad(numbers).any():
         raise ParamError(allowed.refusal(numbers))
 

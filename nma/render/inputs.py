@@ -152,7 +152,7 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
     for name, value in given.items():
         if isinstance(value, mi.Texture):
             raise ParamError(
-                f"the adapter knows a single material, so that no texture can drive {name}; leave it out"
+                f"the adapter was trained for a single material, so that no texture can drive {name}; leave it out"
             )
         whole = known.copy()
         whole[adapter.space.slices[name]] = value
@@ -252,7 +252,7 @@ def _read(param: Param, props: Any) -> Any:
     if kind in (kinds.Color, kinds.Vector):
         return _numbers(param, [float(value[i]) for i in range(3)])
     wanted = "a number, a texture" if param.size == 1 else "a number, a colour (rgb), a texture"
-    raise ParamError(f"{param.name} wants {wanted}, got {str(kind).rpartition('.')[2].lower()} {value!r}")
+    raise ParamError(f"{param.name} needs {wanted}, got {str(kind).rpartition('.')[2].lower()} {value!r}")
 
 
 def _numbers(param: Param, channels: Any) -> Any:
@@ -261,7 +261,7 @@ def _numbers(param: Param, channels: Any) -> Any:
         return channels
     if len(set(channels)) > 1:
         colour = ", ".join(f"{x:g}" for x in channels)
-        raise ParamError(f"{param.name} wants one number or a texture, got the colour {colour}")
+        raise ParamError(f"{param.name} needs one number or a texture, got the colour {colour}")
     return channels[:1]
 
 
@@ -295,7 +295,7 @@ def _setting(props: Any, name: str, default: Any) -> Any:
     value = props.get(name, default)
     if not isinstance(value, type(default)):
         wanted = "true or false (boolean)" if isinstance(default, bool) else "a name (string)"
-        raise ParamError(f"{name} wants {wanted}, got {value!r}")
+        raise ParamError(f"{name} needs {wanted}, got {value!r}")
     return value
 
 

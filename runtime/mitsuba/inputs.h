@@ -173,7 +173,7 @@ private:
         }
         const Colour& c = input.shown;
         if (p.size == 1 && (c.x() != c.y() || c.x() != c.z()))
-            Throw("%s wants one number or a texture, got the colour %g, %g, %g", p.name, c.x(), c.y(), c.z());
+            Throw("%s needs one number or a texture, got the colour %g, %g, %g", p.name, c.x(), c.y(), c.z());
         return input;
     }
 

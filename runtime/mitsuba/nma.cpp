@@ -95,14 +95,16 @@ private:
         p.low = -1e30, p.high = 1e30;
         const Inputs given(props, {p}, false);
         if (given.textured())
-            Throw("the adapter knows a single material, so that no texture can drive %s; leave it out", p.name);
+            Throw("the adapter was trained for a single material, so that no texture can drive %s; leave it out",
+                  p.name);
         float numbers[MOST_PARAMETERS];
         given.at(dr::zeros<SurfaceInteraction3f>(), numbers);
         for (int c = 0; c < p.size; ++c)
             if (!nma::same(numbers[c], known[c]))
                 Throw(
-                    "the adapter knows a single material, whose %s is %g, not %g; fit one to that material, or take "
-                    "the adapter of a class",
+                    "the adapter was trained for a single material, whose %s is %g, not %g; fit another adapter to "
+                    "your "
+                    "material, or use an adapter of its class",
                     p.name, known[c], numbers[c]);
     }
 

@@ -158,7 +158,7 @@ inline Vec3<T> sample_visible_normal(const Vec3<T>& wi, T alpha_x, T alpha_y, T 
     return normalize(Vec3<T>{alpha_x * m_std.x, alpha_y * m_std.y, maximum(m_std.z, T(1e-09))});
 }
 
-// Unpolarised reflectance and cosine of refraction for cos_i >= 0; (1, 0) at total internal reflection.
+// Unpolarised reflectance and cosine of the refracted direction for cos_i >= 0; (1, 0) at total internal reflection.
 template <class T>
 inline std::tuple<T, T> fresnel_dielectric(T cos_i, T eta) {
     const auto cos2_t = T(1.0) - (T(1.0) - cos_i * cos_i) / (eta * eta);
