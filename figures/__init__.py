@@ -1,1 +1,1 @@
-"""Experiments: the scripts that make the figures and tables of the project."""
+"""Experiments: scripts that make the plots, pictures and tables of results in this folder."""

@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 
 
 def experiments() -> dict[str, Path]:
-    """Name and script of every experiment. An experiment is a folder here with a `run.py`."""
+    """Returns the name and the script of every experiment: a folder of figures/ that contains a file `run.py`."""
     return {script.parent.name: script for script in sorted(HERE.glob("*/run.py"))}
 
 

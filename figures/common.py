@@ -1,4 +1,4 @@
-"""Shared by the experiments: the command line, the folders of results, the reference tables, and writing results."""
+"""Functions that the experiments share: command line, folder of results, reference tables, metrics and saving."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from nma.params import Population
 
 ROOT = Path(__file__).parent.parent
 REFERENCES = ROOT / "out/references"
-# The folder of measured materials. They are not part of this repository.
+# The folder of the measured materials. The measurements are not part of this repository.
 DATA = Path(os.environ.get("NMA_TEST_DATA") or ROOT.parent / "shared/data")
-# The sets of unseen materials: (number of materials, population, seed).
+# Sets of materials that no adapter was trained on, by name: (number of materials, population, seed).
 SETS: dict[str, tuple[int, Population, int]] = {
     "range": (89, "range", 89),
     "metals": (60, "unseen_metals", 60),
@@ -35,14 +35,14 @@ REFERENCE_WALKS = 64_000_000
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
-    """A command-line parser with `--quick`; `doc` is the script's docstring."""
+    """Returns a command-line parser with the option `--quick`; `doc` is the script's docstring."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--quick", action="store_true", help="a small, short run, in under two minutes")
     return made
 
 
 def results(script: str, quick: bool) -> Path:
-    """The folder for results: the script's own folder, or out/figures/NAME for a quick run."""
+    """Creates and returns the folder for results: the script's own folder, or out/figures/NAME for a quick run."""
     home = Path(script).resolve().parent
     folder = ROOT / "out/figures" / home.name if quick else home
     folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
 
 
 def reference(name: str, quick: bool) -> nma.Tables:
-    """The reference tables of a set in SETS. If the file does not exist, `nma simulate` makes it."""
+    """Returns the reference tables of a set in SETS. If their file does not exist, `nma simulate` makes the file."""
     count, population, seed = SETS[name]
     count, walks = (4, 4_000_000) if quick else (count, REFERENCE_WALKS)
     path = REFERENCES / f"{name}-{count}x{walks}.npz"
@@ -69,7 +69,7 @@ def reference(name: str, quick: bool) -> nma.Tables:
     words = [str(word) for option in options.items() for word in option]
     REFERENCES.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:
-        # If another experiment is simulating the same set, wait for it.
+        # Wait while another experiment simulates the same set.
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
@@ -77,15 +77,15 @@ def reference(name: str, quick: bool) -> nma.Tables:
 
 
 def kept(path: Path, make: Callable[[], Any], again: bool = False) -> Any:
-    """Returns the content of a JSON file. If the file does not exist, or with `again`, calls `make` and writes its
-    result to the file first."""
+    """Returns the content of a JSON file. If the file does not exist or `again` is true, first calls `make` and writes
+    the result of the call to the file."""
     if again or not path.exists():
         files.write_text(path, json.dumps(make()))
     return json.loads(path.read_text())
 
 
 def save_array(path: Path, array: NDArray) -> None:
-    """Writes an .npy file."""
+    """Writes the array to an .npy file."""
     with files.whole(path) as file:
         np.save(file, array)
 
@@ -93,13 +93,13 @@ def save_array(path: Path, array: NDArray) -> None:
 def figures(
     adapter: nma.Adapter, tables: nma.Tables, directions: int | None = None
 ) -> list[dict[str, float]]:
-    """The adapter's figures for every material of the tables. The tables must have standard errors.
+    """Returns the adapter's metrics for every material of the tables. The tables must have standard errors.
 
-    This integrates the adapter over the bins once. `nma.evaluate_adapter` integrates twice, to measure its own
-    accuracy.
+    The adapter is integrated over the bins once. (`nma.evaluate_adapter` integrates twice, to measure the accuracy of
+    the integration.)
 
     Args:
-        directions: how many values of cos(theta_i) per row of a table; None for the default of `tabulate_adapter`.
+        directions: number of values of cos(theta_i) in each row of a table; None for the default of `tabulate_adapter`.
     """
     assert tables.error is not None
     return [
@@ -109,5 +109,5 @@ def figures(
 
 
 def row(angle: float, rows: int) -> int:
-    """The index of the table row that contains this angle of incidence [degrees]; the table has `rows` rows."""
+    """Returns the index of the table row that contains the angle of incidence `angle` [degrees], of `rows` rows."""
     return min(int(math.cos(math.radians(angle)) * rows), rows - 1)

@@ -1,9 +1,10 @@
-"""What each choice of the training recipe is worth: the preset `class` with one setting changed, and the paper's.
+"""Ablation of the training recipe: the preset `class` with one setting changed at a time, and the preset `paper`.
 
     python -m figures.ablation.run [--quick] [--data layered3.zarr] [--steps 15000]
 
-Trains on a dataset of 8000 materials, which `nma dataset layered3 FOLDER --seed 1` makes, and evaluates on every third
-material of both sets. The figures of finished trainings are kept in out/figures/ablation, so they are not repeated.
+Trains on a dataset of 8000 materials, which `nma dataset layered3 FOLDER --seed 1` makes. Evaluates on every third
+material of the sets "range" and "metals" (figures/common.py). The metrics of finished trainings are kept in
+out/figures/ablation, so a killed run does not repeat these trainings.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import preset
 from nma.train.run import train_class
 
-# The changed settings, by name. The paper's recipe sees as many bins in total as ours. It runs at its own learning rate
-# and at higher ones.
+# The changed settings, by name. The paper's recipe is trained at its own learning rate (1e-5) and at higher learning
+# rates.
 CHANGES: dict[str, dict[str, Any]] = {
     "class": {},
     "no albedo": {"albedo": 0.0},
@@ -58,7 +59,7 @@ def main() -> None:
     names = arguments.only or list(CHANGES)[: 2 if arguments.quick else None]
     steps = 100 if arguments.quick else arguments.steps
     references = {name: common.reference(name, arguments.quick)[::3] for name in common.SETS}
-    # The dataset is read when a training first needs it.
+    # The dataset is read only if a training needs it.
     tables = cache(lambda: data(arguments.data, arguments.quick))
     results = {}
     for name in names:
@@ -78,7 +79,7 @@ def data(path: Path, quick: bool) -> nma.Tables:
 
 
 def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma.Tables], steps: int) -> dict:
-    """Trains with one change, and returns the figures. Every training sees as many bins as the preset `class` sees in
+    """Trains with one change, and returns the metrics. Every training uses as many bins as the preset `class` uses in
     `steps` steps."""
     change = dict(CHANGES[name])
     recipe = preset(change.pop("preset", "class"), **change)
@@ -94,7 +95,7 @@ def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma
 
 
 def plot(results: dict, path: Path) -> None:
-    """Draws log loss and albedo error of every change as bars, for both sets."""
+    """Draws bars for the log loss and the albedo error of every change, for both sets of materials."""
     figure = Figure(figsize=(10, 1.2 + 0.35 * len(results)), layout="constrained")
     names, places = list(results), np.arange(len(results))
     for axes, quantity in zip(figure.subplots(1, 2, sharey=True), ("log_loss", "albedo_error"), strict=True):

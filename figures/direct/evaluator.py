@@ -1,9 +1,9 @@
-"""A network that evaluates f cos(theta_o) itself: a latent per material, and a decoder of about a million weights.
+"""A network that evaluates f cos(theta_o) directly: a latent code per material, and a decoder with a million weights.
 
 The latent size, and roughly the decoder size, are those of Fan et al. 2022, "Neural Layered BRDFs", as the NMA paper
-states them. Their weights and data are not available, so everything else is ours. To make the comparison fair, the
-network sees half-vector coordinates (Rusinkiewicz 1998), in which highlights are simple, and it learns with the
-adapter's data, loss and optimiser.
+states them. The weights and data of Fan et al. are not available, so all other choices are our own. To make the
+comparison fair, the network's inputs are half-vector coordinates (Rusinkiewicz 1998), in which highlights have a simple
+shape. The network is trained with the adapter's data, loss and optimiser.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from nma.train.recipe import Recipe, preset
 
 LATENT = 32
 FEATURES = 6
-# The untrained network predicts about this value of log(1 + f cos).
+# The initial biases make the untrained network return about this value of log(1 + f cos(theta_o)).
 _INITIAL = 0.05
-# The network cannot tell half vectors apart whose sines are far below this value.
+# The inputs do not resolve half angles whose sines are far below this value.
 _SHARPEST = 1e-3
 
 
 class Evaluator(NamedTuple):
-    """What is trained: latents (materials, LATENT), and a decoder from latent and directions to log(1 + f cos)."""
+    """Latent codes (materials, LATENT), and a decoder: from code and directions to log(1 + f cos(theta_o))."""
 
     latents: Any
     decoder: Layers
 
 
 def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
-    """The adapter's recipe as far as it applies: data, bins, loss, schedule and averaging of weights."""
+    """Returns the adapter's recipe, with the settings changed that do not suit the direct evaluator."""
     return preset(
         "class",
         network=network_name,
@@ -58,7 +58,7 @@ def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
 
 
 def start(materials: int, how: Recipe) -> Evaluator:
-    """Random latents and layers, from the recipe's seed."""
+    """Returns random latent codes and layers, from the recipe's seed."""
     rng = np.random.default_rng((how.seed, 0xD1EC7))
     sizes = [LATENT + FEATURES, *network.hidden(how.network), 3]
     decoder = network.init(rng, sizes, np.full(3, np.log(np.expm1(_INITIAL))))
@@ -67,15 +67,18 @@ def start(materials: int, how: Recipe) -> Evaluator:
 
 
 def evaluate(decoder: Layers, latent: Any, wi: Vec3, wo: Vec3) -> Any:
-    """f cos(theta_o) [1/sr], (..., 3), as a JAX array; `latent` has the shape (..., LATENT)."""
+    """Returns f cos(theta_o) [1/sr] as a JAX array (..., 3) for the latent codes `latent` (..., LATENT)."""
     seen = jnp.stack(_features(wi, wo), axis=-1)
     latent = jnp.broadcast_to(latent, (*seen.shape[:-1], LATENT))
     return jnp.expm1(jax.nn.softplus(network.forward(decoder, jnp.concatenate([latent, seen], axis=-1))))
 
 
 def _features(wi: Vec3, wo: Vec3) -> list[Any]:
-    """The network's inputs, about -1 .. 1: the cosines of wi, wo, half angle and difference angle, the logarithm of the
-    half angle's sine, and the cosine of the azimuth."""
+    """Returns the network's inputs, scaled to about -1 .. 1.
+
+    The inputs are the cosines of theta_i, theta_o, the half angle and the difference angle, the logarithm of the half
+    angle's sine, and the cosine of the azimuth between wi and wo.
+    """
     half = ops.normalize(wi + wo)
     sine = ops.safe_sqrt(half.x * half.x + half.y * half.y)
     narrow = ops.log(sine + _SHARPEST) / np.log(_SHARPEST)
@@ -93,10 +96,10 @@ def train(
     progress: Callable[[loop.Run], None],
     decoder: Layers | None = None,
 ) -> tuple[Evaluator, loop.Run]:
-    """Trains the latents of the tables' materials, and continues from the checkpoint if there is one.
+    """Trains latent codes for the tables' materials, and continues from the checkpoint if its file exists.
 
     Args:
-        decoder: a decoder that stays fixed; if None, the decoder is trained with the latents.
+        decoder: a decoder that stays fixed; if None, a new decoder is trained together with the latent codes.
     """
     fresh = start(len(tables.params), how)
     begin = fresh if decoder is None else fresh._replace(decoder=decoder)
@@ -115,13 +118,13 @@ def train(
 
 
 def _numbered(tables: nma.Tables) -> Pool:
-    """A pool of the tables. The only parameter of a material is its number, which selects its latent."""
+    """Returns a pool of the tables. The only parameter of a material is its index, which selects its latent code."""
     numbers = np.arange(len(tables.params), dtype=np.float64)[:, None]
     return Pool.of(replace(tables, params=numbers))
 
 
 def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The adapter's loss; one random point in each bin stands for the bin's mean."""
+    """Returns the adapter's loss, with the bin's mean estimated from one random point in the bin."""
     points = quadrature.uniform_bin_points(batch.i, batch.o, batch.p, tuple(batch.shift))
     latent = evaluator.latents[batch.columns[0].astype(jnp.int32)]
     wi = Vec3(*(jnp.broadcast_to(x, points.wo.z.shape) for x in points.wi))
@@ -130,5 +133,5 @@ def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Arr
 
 
 def _latents_alone(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:
-    """As `_objective`, but the decoder stays fixed."""
+    """Returns the same loss as `_objective`, but without gradients for the decoder, which stays fixed."""
     return _objective(evaluator._replace(decoder=jax.lax.stop_gradient(evaluator.decoder)), batch, how)

@@ -1,12 +1,15 @@
-"""Paper Table 5 and Fig. 11: the adapters compared with a network of a million weights that evaluates f itself.
+"""Paper Table 5 and Fig. 11: the adapters compared with a network of a million weights that evaluates f directly.
 
     python -m figures.direct.run [--quick] [--data FOLDER.zarr] [--steps N] [--latent-steps N]
 
-Trains a decoder, and a latent for each material, on the adapters' dataset (evaluator.py). Then it trains latents of the
-89 validation materials on the materials' own references, as the paper does for Fan et al. 2022. The adapters see only
-the parameters of these materials. Both kinds of model are evaluated at random points, which are averaged in every bin.
-Trainings continue from checkpoints in out/figures/direct.
-Writes direct.json, direct.md and direct.png beside this file; with --quick, of a small network, to out/figures/direct.
+First trains a direct evaluator on the adapters' dataset: a decoder, and a latent code for each material (evaluator.py).
+Then fits latent codes for the 89 validation materials to the materials' own references, as the paper does for Fan et
+al. 2022. The adapters have not seen these references: their input is the materials' parameters. The direct evaluator
+and the adapters are evaluated at random points in every bin, and the values are averaged over each bin. A killed
+training continues from its checkpoint in out/figures/direct.
+
+Writes direct.json, direct.md and direct.png beside this file. With --quick, trains a small network and writes to
+out/figures/direct.
 """
 
 from __future__ import annotations
@@ -37,11 +40,12 @@ from nma.table.dataset import Settings, simulate_block
 
 SET = "range"
 NETWORK, QUICK_NETWORK = "5x512", "2x32"
-# Points per bin, as in the paper. The direct evaluator gets fewer points, because it is slow and smooth within a bin.
+# Points per bin for the adapters (as in the paper) and for the direct evaluator. The evaluator gets fewer points,
+# because it is slow and varies little within a bin.
 POINTS, DIRECT_POINTS = 10, 2
-# How many points are evaluated at a time.
+# The number of points that are evaluated at a time.
 BATCH = 8192
-# The paper has 40 x 80 x 40 x 80 bins. Ours are fewer, but hold all of their values if the material is isotropic.
+# The paper has 40 x 80 x 40 x 80 bins with 10 points each.
 PAPER_POINTS = 40 * 80 * 40 * 80 * 10
 COLUMNS = {
     "ae": "AE",
@@ -55,7 +59,7 @@ PAPER = {
     "paper: NMA 5x64": {"ae": 0.0065, "psnr": 45.5, "smape": 0.100, "log_loss": 0.0037, "seconds": 3.76},
     "paper: Fan et al.": {"ae": 0.0130, "psnr": 39.7, "smape": 0.257, "log_loss": 0.0100, "seconds": 99.78},
 }
-# A function of a material's number, wi and wo (n,) that returns f cos(theta_o) (n, 3).
+# A function of a material's index, wi and wo (n,) that returns f cos(theta_o) (n, 3).
 Evaluate = Callable[[int, Vec3, Vec3], NDArray]
 
 
@@ -94,12 +98,12 @@ def main() -> None:
 
 
 def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict[str, Any]]:
-    """Returns the evaluator with latents of the validation materials, and the bins and seconds of its training."""
+    """Returns the evaluator with latent codes of the validation materials, and the bins and seconds of its training."""
     quick, kept = arguments.quick, common.ROOT / "out/figures/direct"
     kept.mkdir(parents=True, exist_ok=True)
     settings, tables = data(arguments.data, quick)
     how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
-    # The decoder is trained without the validation set.
+    # The decoder's training does not depend on the validation set, so its file name does not contain the set.
     stem = f"{how.network}_{settings.materials}_{how.steps}-steps"
     record: dict[str, Any] = {"dataset": asdict(settings)}
     with console.TrainingBar(how, "decoder") as bar:
@@ -125,7 +129,7 @@ def data(path: Path, quick: bool) -> tuple[Settings, nma.Tables]:
 
 
 def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
-    """The adapter as a function of points. Its network runs at every point, as in the paper."""
+    """Returns a function that evaluates the adapter, and runs its network at every point, as in the paper."""
     encode, materials = encoding.get(adapter.encoding), params.astype(np.float32)
 
     def at_points(material: jax.Array, wi: Vec3, wo: Vec3) -> jax.Array:
@@ -143,7 +147,7 @@ def of_evaluator(trained: direct.Evaluator) -> Evaluate:
 
 
 def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any, Vec3, Vec3], NDArray]:
-    """Compiles the function, and runs it on batches that fit into the cache of a CPU."""
+    """Returns the compiled function, applied to batches of points that fit into the cache of a CPU."""
 
     @jax.jit
     def compiled(material: Any, wi: Vec3, wo: Vec3) -> jax.Array:
@@ -159,7 +163,7 @@ def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any,
 
 
 def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, Any]:
-    """Returns the figures of every material, their means, and the seconds for PAPER_POINTS points."""
+    """Returns the metrics of every material, the mean metrics, and the seconds for PAPER_POINTS points."""
     i, o, p = np.stack(np.unravel_index(np.arange(ISOTROPIC.bins), ISOTROPIC.shape[:3])).astype(np.float32)
     assert reference.error is not None
     materials, seconds = [], []
@@ -174,7 +178,7 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
         materials.append(table_metrics(mean, table, reference.error[number]))
     rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
     means = {k: round(v, 6) for k, v in mean_metrics(materials).items()}
-    # The first material includes compilation. The median ignores it.
+    # The time of the first material includes compilation. The median ignores this outlier.
     return {
         "mean": means,
         "seconds": round(float(np.median(seconds)) * PAPER_POINTS, 2),
@@ -183,7 +187,7 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
 
 
 def figures(materials: list[dict[str, float]]) -> dict[str, Any]:
-    """The figures of each material, rounded, and their means."""
+    """Returns the rounded metrics of every material, and their means."""
     rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
     return {"mean": {k: round(v, 6) for k, v in mean_metrics(materials).items()}, "materials": rounded}
 
@@ -193,7 +197,7 @@ def print_means(name: str, result: dict[str, Any]) -> None:
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """Our Table 5 in Markdown, with the paper's rows below ours."""
+    """Returns our Table 5 in Markdown, with the rows of the paper's Table 5 below our rows."""
     lines = ["| | " + " | ".join(COLUMNS.values()) + " | time, s | parameters |", "|---" * 8 + "|"]
     for name, result in results.items():
         cells = [f"{result['mean'][k]:.4g}" for k in COLUMNS]
@@ -210,7 +214,7 @@ def markdown(results: dict[str, Any]) -> str:
 
 
 def plot(results: dict[str, Any], path: Path) -> None:
-    """Draws Fig. 11: absolute error and log loss of every material, sorted by the direct evaluator's absolute error."""
+    """Plots AE and log loss of every material, sorted by the direct evaluator's AE (Fig. 11)."""
     curves: dict[str, tuple[list, dict[str, Any]]] = {}
     for name, result in results.items():
         if "exact" in result:

@@ -1,11 +1,13 @@
-"""Directional albedo of the shipped adapters over 100,000 random materials and 64 angles: it never exceeds 1 (eq. 5).
+"""Directional albedo of the shipped adapters for 100,000 random materials and 64 angles. No albedo exceeds 1 (eq. 5).
 
     python -m figures.energy.run [--quick]
 
-An albedo is the mean of value / pdf over samples of the target itself. The first round estimates all pairs of material
-and angle coarsely. Each further round estimates the brightest pairs again, with more samples. Every round makes two
-independent estimates; their difference gives the error. All rounds are repeated without the energy bound. Writes
-energy.json and energy.png beside this file.
+The albedo is estimated as the mean of value / pdf over samples that the adapter draws. The first round estimates the
+albedo of all pairs of material and angle with few samples. Each further round estimates the brightest pairs again, with
+more samples. Every round makes two independent estimates, whose difference gives the statistical error. All rounds are
+repeated without the energy bound.
+
+Writes energy.json and energy.png beside this file. With --quick, takes 500 materials and writes to out/figures/energy.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from nma.table import quadrature
 
 ANGLES = 64
 CHUNK = 1_000_000
-# For each round: how many pairs are estimated (None for all), and how many samples each pair gets.
+# For each round: the number of pairs of material and angle (None for all pairs), and the number of samples per pair.
 ROUNDS = ((None, 64), (50_000, 1024), (2_000, 16_384), (100, 2**20))
 QUICK_ROUNDS = ((None, 64), (1_000, 1024), (100, 2**16))
 
@@ -46,7 +48,7 @@ def main() -> None:
 
 
 def measure(adapter: nma.Adapter, params: np.ndarray, rounds: tuple) -> tuple[dict, np.ndarray]:
-    """Returns the largest albedo with its error, material and angle; and the largest coarse estimate at each angle."""
+    """Returns the largest albedo with its error, material and angle, and the first round's largest albedo per angle."""
     mu = (np.arange(ANGLES) + 0.5) / ANGLES
     pairs = np.arange(len(params) * ANGLES)
     coarse, result = np.empty(0), {}
@@ -60,7 +62,7 @@ def measure(adapter: nma.Adapter, params: np.ndarray, rounds: tuple) -> tuple[di
             envelope = coarse.reshape(len(params), ANGLES).max(axis=0)
         result = {
             "largest_albedo": round(float(coarse[best]), 5),
-            # The error of the mean of two estimates is about half of their difference.
+            # The error of the mean of two estimates is about half of the difference between the estimates.
             "error": round(float(np.abs(estimates[0] - estimates[1]).mean() / 2), 6),
             "pairs_above_1": int((coarse > 1.0005).sum()),
             "cos_theta_i": float(mu[pairs[best] % ANGLES]),
@@ -72,13 +74,13 @@ def measure(adapter: nma.Adapter, params: np.ndarray, rounds: tuple) -> tuple[di
 def albedos(
     adapter: nma.Adapter, params: np.ndarray, mu: np.ndarray, pairs: np.ndarray, samples: int, shift: float
 ) -> np.ndarray:
-    """The albedo of the brightest channel for each pair of material and angle, from `samples` samples each.
+    """Estimates the albedo of the brightest channel, from `samples` samples for each pair of material and angle.
 
     Args:
         params: materials (n, 13).
         mu: cosines of the angles (ANGLES,).
-        pairs: material * ANGLES + angle, for each pair.
-        shift: moves the sample points (in units of their period); another shift makes another estimate.
+        pairs: for each pair, the index material * ANGLES + angle.
+        shift: offset that is added to the sample points, modulo 1. Another offset gives another estimate.
     """
     chunk = max(1, min(CHUNK, 2**28 // samples))
     parts = np.array_split(pairs, -(-len(pairs) // chunk))
@@ -103,14 +105,14 @@ def _albedos(
         weights = [Sum(dr.select(pdf > 0, c / pdf, 0.0)) for c in value]
         return k + 1, *(s + w for s, w in zip(sums, weights, strict=True))
 
-    # Sums are in double precision. In single precision, the rounding errors of a million terms would add up.
+    # Sums are in double precision, because a million terms in single precision would have large rounding errors.
     start: Any = (dr.zeros(UInt32, len(mu)), *(dr.zeros(Sum, len(mu)) for _ in range(3)))
     sums = dr.while_loop(start, lambda k, *_: k < samples, body, mode="symbolic", label="albedo")[1:]
     return np.max([s.numpy() for s in sums], axis=0) / samples
 
 
 def plot(curves: dict[str, np.ndarray], path: Path) -> None:
-    """Draws the largest albedo of all materials over the angle, from the coarse estimates."""
+    """Plots the largest albedo of all materials against cos(theta_i), from the estimates of the first round."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot(
         xlabel="cos(theta_i)",

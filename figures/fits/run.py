@@ -2,7 +2,8 @@
 
     python -m figures.fits.run [--quick] [MATERIAL ...]
 
-Writes fits.json and fits.png beside this file; with --quick, one material and few walks, to out/figures/fits.
+Writes fits.json and fits.png beside this file. With --quick, fits one material with few walks and writes to
+out/figures/fits.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def fit(name: str, walks: int, reference_walks: int, quick: bool) -> dict:
 
 
 def plot(rows: list[dict], path: Path) -> None:
-    """Draws log loss and albedo error of every material as bars, with the noise of the references."""
+    """Draws bars for the log loss and the albedo error of every material, and marks the noise of the references."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     names = [row["name"] for row in rows]

@@ -1,15 +1,14 @@
-"""The named materials in the preview scene, the two lightings of this scene, and the noise in each lighting.
+"""Pictures of the named materials in the preview scene, and the noise of pictures in its two lightings.
 
     python -m figures.gallery.run [--quick] [--adapter FILE]
 
-Writes three files beside this one:
+Writes three files beside this script:
 
-gallery.png   every named material, and one with textures
+gallery.png   every named material, and a material with textures
 lighting.png  six materials in both lightings
-gallery.json  the noise of pictures with 128 samples per pixel: as `nma render` made them before it had a studio, as it
-              makes them now, and with clamped samples
+gallery.json  the noise of pictures with 128 samples per pixel, for each entry of WAYS
 
-With --quick, two materials, in small pictures of few samples, to out/figures/gallery.
+With --quick, renders small pictures of two materials with few samples, and writes to out/figures/gallery.
 """
 
 from __future__ import annotations
@@ -35,7 +34,8 @@ from nma.render.progressive import render_passes, sampler
 
 Image = NDArray[np.float32]
 COLUMNS = 5
-# Six materials of different looks: two coloured or wet coats, two paints, a dark metal, and a metal under a white haze.
+# Six materials of different appearance: two smooth coats on metal, two paints, a dark metal, and a metal under a rough
+# coat.
 SIX = (
     "gold-red-lacquer",
     "wet-nickel",
@@ -45,17 +45,16 @@ SIX = (
     "frosted-silver",
 )
 CLAMP = 5.0
-FIREFLY, VISIBLE = (
-    5.0,
-    0.02,
-)  # a firefly is FIREFLY times, and at least VISIBLE, brighter than its neighbours' median
+# A firefly is a pixel that is brighter than FIREFLY times the median of its neighbourhood, and exceeds this median by
+# more than VISIBLE.
+FIREFLY, VISIBLE = 5.0, 0.02
 
 
 class Effort(NamedTuple):
-    """Pixels on a side and samples per pixel.
+    """Sizes of the pictures (pixels on a side) and samples per pixel.
 
-    `size` and `spp` are for the two sheets of pictures, `noise_size` and `noise_spp` for the pictures whose noise is
-    measured. `reference_spp` is for the converged pictures that they are compared with.
+    `size` and `spp` are for the two sheets of pictures. `noise_size` and `noise_spp` are for the pictures whose noise
+    is measured, and `reference_spp` is for the converged pictures that the noisy pictures are compared with.
     """
 
     size: int = 208
@@ -110,7 +109,7 @@ def textured(adapter: str) -> dict[str, Any]:
 
 
 def render(bsdf: dict[str, Any], size: int, spp: int, way: Way, seed: int = 0) -> Image:
-    """A picture (size, size, 3) of the ball with this BSDF."""
+    """Renders a picture (size, size, 3) of the shader ball with the BSDF `bsdf`."""
     options: dict[str, Any] = {"size": (size, size), "lighting": way.lighting, "sampler": way.sampler}
     scene = load_dict(nma.preview_scene(bsdf, **options))
     integrator = clamped(scene.integrator(), way.clamp) if way.clamp else None
@@ -135,7 +134,7 @@ def gallery(shown: dict[str, dict[str, Any]], effort: Effort, path: Path) -> Non
 
 
 def wrapped(title: str, width: int = 28) -> str:
-    """Splits a title that is too long into two lines, at a space."""
+    """Splits a title of more than `width` characters into two lines, at a space."""
     if len(title) <= width:
         return title
     cut = title.rindex(" ", 0, width)
@@ -143,7 +142,7 @@ def wrapped(title: str, width: int = 28) -> str:
 
 
 def lightings(six: dict[str, dict[str, Any]], effort: Effort, path: Path) -> None:
-    """Writes a sheet with the six materials outdoors in the upper row and in the studio in the lower row."""
+    """Writes a sheet with the six materials: outdoors in the upper row, in the studio in the lower row."""
     size, spp = effort.size, effort.spp
     kind = sampler(spp, size * size)
     rows = [
@@ -155,8 +154,8 @@ def lightings(six: dict[str, dict[str, Any]], effort: Effort, path: Path) -> Non
 
 
 def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str, float]]:
-    """For each way to render: relative RMSE, fireflies, processor seconds, and brightness relative to the converged
-    picture."""
+    """Returns for each entry of WAYS: relative RMSE, number of fireflies, processor seconds, and brightness relative to
+    the converged picture."""
     lightings = dict.fromkeys(way.lighting for way in WAYS.values())
     references = {
         lighting: render(bsdf, effort.noise_size, effort.reference_spp, Way(lighting, "multijitter"), seed=1)
@@ -165,7 +164,8 @@ def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str
     found = {}
     for label, way in WAYS.items():
         converged = references[way.lighting]
-        render(bsdf, effort.noise_size, 1, way)  # compile before the clock starts
+        # The first rendering compiles the kernels, so that the measured time excludes compilation.
+        render(bsdf, effort.noise_size, 1, way)
         began = time.process_time()
         picture = render(bsdf, effort.noise_size, effort.noise_spp, way, seed=2)
         found[label] = {
@@ -179,7 +179,7 @@ def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str
 
 
 def fireflies(image: Image) -> NDArray[np.bool_]:
-    """Marks the pixels (height, width) that are visibly brighter than the median of their 3 x 3 neighbourhood."""
+    """Marks the pixels (height, width) that are much brighter than the median of their 3 x 3 neighbourhood."""
     brightness = np.pad(image.mean(axis=2), 1, mode="edge")
     around = np.median(sliding_window_view(brightness, (3, 3)), axis=(2, 3))
     return brightness[1:-1, 1:-1] > np.maximum(FIREFLY * around, around + VISIBLE)
