@@ -14,6 +14,7 @@ from nma.errors import ParamError, TableError
 from nma.evaluate import adapters, metrics, tabulate_adapter
 from nma.evaluate.metrics import counting_error, noise_floor, table_metrics
 from nma.jit import dr
+from nma.lattice import lattice_points
 from nma.ops import Color, Vec3
 from nma.params import LAYERED3
 from nma.table import ISOTROPIC, Tables, quadrature
@@ -71,7 +72,7 @@ def fine_means(adapter, bins, points=1 << 11, repeats=6):
     means = []
     for repeat in range(repeats):
         shift = np.random.default_rng(repeat).random((3, 1, len(bins)))
-        u = (quadrature.lattice(points).T[:, :, None] + shift) % 1.0
+        u = (lattice_points(points).T[:, :, None] + shift) % 1.0
         i, o, p = (Float(np.broadcast_to(x, u[0].shape).ravel().astype(np.float32)) for x in bins.T)
         found = quadrature.bin_points(i, o, p, tuple(Float(x.ravel().astype(np.float32)) for x in u))
         brdf = adapter.prepare([Float(0.5)] * 13, found.wi)

@@ -13,6 +13,7 @@ from scipy import stats
 
 from nma import ops
 from nma.jit import dr
+from nma.lattice import lattice_points
 from nma.microfacet import ggx_d, smith_g1
 from nma.ops import Vec3
 from nma.table import Grid, quadrature
@@ -48,7 +49,7 @@ BINS = np.array(
 def shifted(n, shape, seed):
     """Lattices of n points (3, n, *shape), each shifted at random."""
     shift = np.random.default_rng(seed).random((3, 1, *shape))
-    lattice = quadrature.lattice(n).T.reshape(3, n, *(1,) * len(shape))
+    lattice = lattice_points(n).T.reshape(3, n, *(1,) * len(shape))
     return (lattice + shift) % 1.0
 
 
@@ -252,7 +253,7 @@ def test_other_grids_work_too():
 
 def test_lattice_points_are_well_spread():
     """Each of 512 cells of the cube has about an equal share of 4096 points."""
-    points = quadrature.lattice(4096)
+    points = lattice_points(4096)
     assert points.shape == (4096, 3)
     cells = np.bincount((points * 8).astype(int) @ [64, 8, 1], minlength=512)
     assert cells.min() >= 4

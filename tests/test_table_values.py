@@ -10,6 +10,7 @@ from test_quadrature import LOBE_BINS, assert_means, lobe, mean_of_bin
 from nma import ops
 from nma.errors import TableError
 from nma.evaluate import metrics
+from nma.lattice import lattice_points
 from nma.ops import Color, Vec3
 from nma.sources.merl import Merl
 from nma.sources.mitsuba_bsdf import from_dict
@@ -262,7 +263,7 @@ def test_points_of_anisotropic_bins_have_no_preference(crowded):
     bins = np.minimum(FOUR, [5, 9, 7, 11])
     i, a, o, b = bins.T
     shift = np.random.default_rng(8).random((4, 1, 16, len(bins)))
-    u = (quadrature.lattice(2048, 4).T.reshape(4, 2048, 1, 1) + shift) % 1.0
+    u = (lattice_points(2048, 4).T.reshape(4, 2048, 1, 1) + shift) % 1.0
     points = quadrature.points((i, a, o, b), u, grid, quadrature.FINEST if crowded else None)
     mu_i, mu_o, phi_i, phi_o = (i + 0.5) / 6, (o + 0.5) / 8, (a + 0.5) * math.pi / 5, (b + 0.5) * math.pi / 6
     at_i, at_o = ((np.arctan2(w.y, w.x) % (2 * math.pi)) for w in (points.wi, points.wo))
@@ -289,6 +290,6 @@ def test_crowded_points_of_anisotropic_bins_have_the_mean_of_even_ones():
         (quadrature.anisotropic_bin_points, 1 << 15),
         (quadrature.uniform_anisotropic_bin_points, 1 << 19),
     ):
-        points = law(i, a, o, b, tuple(quadrature.lattice(n, 4).T[..., None]), grid)
+        points = law(i, a, o, b, tuple(lattice_points(n, 4).T[..., None]), grid)
         means.append((points.weight * lobe(points.wi, points.wo, 0.05)).mean(axis=0))
     np.testing.assert_allclose(means[0], means[1], rtol=0.03)

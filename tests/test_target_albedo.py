@@ -9,8 +9,8 @@ import pytest
 
 from nma import target
 from nma.jit import dr
+from nma.lattice import lattice_points
 from nma.ops import Color, Vec3
-from nma.table import quadrature
 from nma.target import PRINCIPLED_PARAMS, STRETCHED_PARAMS, Blend, Principled
 from nma.target.albedo import lobe_albedos
 from nma.target.decode import output_size
@@ -42,10 +42,7 @@ def estimate(blend, mu):
     ]
     wide = Blend(tuple(instances), tuple(map(spread, blend.weights)), Color(*map(spread, blend.scale)))
     cosine = spread(mu)
-    u = [
-        dr.gather(dr.auto.Float, dr.auto.Float(x.astype(np.float32)), k)
-        for x in quadrature.lattice(SAMPLES).T
-    ]
+    u = [dr.gather(dr.auto.Float, dr.auto.Float(x.astype(np.float32)), k) for x in lattice_points(SAMPLES).T]
     wi = Vec3(dr.sqrt(1 - cosine * cosine), dr.zeros(dr.auto.Float, len(lane)), cosine)
     _, value, pdf = target.sample(wide, wi, *u)
     weights = np.stack([dr.select(pdf > 0, c / pdf, 0.0).numpy() for c in value]).reshape(3, CASES, SAMPLES)

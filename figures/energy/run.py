@@ -23,7 +23,7 @@ import nma
 from figures import common
 from nma import ops, target
 from nma.jit import dr
-from nma.table import quadrature
+from nma.lattice import lattice_points
 
 ANGLES = 64
 CHUNK = 1_000_000
@@ -97,7 +97,7 @@ def _albedos(
     curves = [Float(np.broadcast_to(np.asarray(x, np.float32), len(mu)).copy()) for x in flat]
     wi = ops.at_azimuth_0(Float(mu.astype(np.float32)))
     brdf = adapter.from_numbers(curves, wi)
-    lattice = [Float(x.astype(np.float32)) for x in ((quadrature.lattice(samples) + shift) % 1.0).T]
+    lattice = [Float(x.astype(np.float32)) for x in ((lattice_points(samples) + shift) % 1.0).T]
 
     def body(k, *sums):
         u = [dr.gather(Float, x, k) for x in lattice]

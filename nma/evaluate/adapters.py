@@ -14,6 +14,7 @@ from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.evaluate import metrics
 from nma.jit import dr
+from nma.lattice import lattice_points
 from nma.table import ISOTROPIC, Grid, Tables, quadrature
 from nma.table.walks import bin_index
 
@@ -100,7 +101,7 @@ def _by_points(
     o = Float((bins // grid.phi_o) % grid.theta_o)
     p = Float(bins % grid.phi_o)
     shifts = [quadrature.hashed(bins * 2 + k, seed) for k in range(2)]
-    lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(directions * _POINTS).T[:2]]
+    lattice = [Float(x.astype(np.float32)) for x in lattice_points(directions * _POINTS).T[:2]]
 
     def body(k: Any, red: Any, green: Any, blue: Any) -> tuple[Any, Any, Any, Any]:
         at = row * directions + k // _POINTS
@@ -131,7 +132,7 @@ def _by_samples(
     mu = dr.gather(Float, cosines, at)
     wi = ops.at_azimuth_0(mu)
     brdf = adapter.from_numbers([dr.gather(Float, c, at) for c in curves], wi)
-    lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(_SAMPLES).T]
+    lattice = [Float(x.astype(np.float32)) for x in lattice_points(_SAMPLES).T]
     shifts = [quadrature.hashed(at * 3 + n, ~seed) for n in range(len(lattice))]
     u = [quadrature.shifted(dr.gather(Float, x, k), s) for x, s in zip(lattice, shifts, strict=True)]
     wo, value, pdf = brdf.sample(wi, *u)

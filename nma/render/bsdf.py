@@ -6,15 +6,13 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
+from nma.lattice import lattice_steps
 from nma.ops import Color, Vec3, minimum, select
 
 # The Mitsuba variants in which our Python BSDFs run: their parameters are RGB, and their code is vectorised.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 # Mitsuba's BSDFs that call one nested BSDF and return its result.
 _HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
-# Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences": this number is the root of x^4 = x + 1, and
-# the powers of its inverse spread points evenly over a cube.
-_SPREAD = 1.2207440846057596
 
 
 def define_base() -> type:
@@ -126,7 +124,7 @@ def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, ac
     mi: Any = mitsuba
 
     def body(k, x, y, z):
-        u = [mi.Float(k) * _SPREAD**-power + 0.5 for power in (1, 2, 3)]
+        u = [mi.Float(k) * step + 0.5 for step in lattice_steps(3)]
         found = draw(k, *(v - dr.floor(v) for v in u))
         return k + 1, x + found.x, y + found.y, z + found.z
 

@@ -11,9 +11,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nma import ops
 from nma.jit import dr
 from nma.ops import Float, Vec3
@@ -23,10 +20,6 @@ from nma.table.grid import ISOTROPIC, Grid
 # narrowest lobe: with coarser points, training makes such lobes too broad.
 FINEST = 0.0005
 
-# For each dimension d, the root of x^(d+1) = x + 1. The steps of a Kronecker lattice are powers of its inverse (Roberts
-# 2018).
-_ROOTS = {3: 1.2207440846057596, 4: 1.1673039782614187}
-
 
 class Points(NamedTuple):
     """Weighted pairs of directions. The mean of `weight * f` over a bin's points estimates the mean of f in the bin."""
@@ -34,12 +27,6 @@ class Points(NamedTuple):
     wi: Vec3
     wo: Vec3
     weight: Float
-
-
-def lattice(n: int, dimensions: int = 3) -> NDArray[np.float64]:
-    """`n` evenly spread points (n, 3 or 4) in the unit cube. Each bin shifts them by random numbers, modulo 1."""
-    steps = np.array([_ROOTS[dimensions] ** -(k + 1) for k in range(dimensions)])
-    return (np.arange(n)[:, None] * steps + 0.5) % 1.0
 
 
 def shifted(x: Float, shift: Float) -> Float:

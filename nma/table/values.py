@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from nma import ops
 from nma.errors import TableError
 from nma.jit import dr
+from nma.lattice import lattice_points
 from nma.ops import Color, Float, Vec3
 from nma.sources.base import Values
 from nma.sources.lookup import Lookup
@@ -145,7 +146,7 @@ def _moments(
     dimensions = 4 if grid.phi_i else 3
     seed, last = dr.opaque(UInt32, number), dr.opaque(UInt32, count)
     shifts = [quadrature.hashed(flat * dimensions + k, seed) for k in range(dimensions)]
-    lattice = [Float(x.astype(np.float32)) for x in quadrature.lattice(count // 2, dimensions).T]
+    lattice = [Float(x.astype(np.float32)) for x in lattice_points(count // 2, dimensions).T]
 
     def body(k: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
         u = [quadrature.shifted(dr.gather(Float, x, k >> 1), s) for x, s in zip(lattice, shifts, strict=True)]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from nma import network, target
 from nma.adapter import encoding
+from nma.lattice import lattice_points
 from nma.network import Layers
 from nma.ops import Vec3
 from nma.table import quadrature
@@ -58,7 +59,7 @@ def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
     if recipe.points_law == "centre":
         u: Any = (0.5 + 0.0 * batch.shift)[:, None]
     else:
-        lattice = jnp.asarray(quadrature.lattice(recipe.points, len(batch.shift)), jnp.float32)
+        lattice = jnp.asarray(lattice_points(recipe.points, len(batch.shift)), jnp.float32)
         u = (lattice.T[:, :, None, None] + batch.shift[:, None]) % 1.0
     finest = recipe.finest if recipe.points_law == "crowded" else None
     return quadrature.points((batch.i, batch.a, batch.o, batch.p), tuple(u), recipe.grid, finest)
@@ -69,7 +70,7 @@ def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
 
     Derivatives treat the samples as constants. The derivatives are therefore unbiased, and no estimate is clipped.
     """
-    lattice = jnp.asarray(quadrature.lattice(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
+    lattice = jnp.asarray(lattice_points(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
     wi = view(batch)
     wo, _, pdf = jax.lax.stop_gradient(brdf).sample(wi, *u)

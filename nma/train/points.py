@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from nma import ops
 from nma.errors import SourceError
 from nma.jit import dr
+from nma.lattice import lattice_points
 from nma.microfacet import visible_normal_pdf
 from nma.ops import Vec3
 from nma.sources.base import Values
-from nma.table import quadrature
 from nma.target.sampling import sample_spec
 from nma.train.loss import albedo_loss, brdf_of, view
 from nma.train.recipe import Recipe
@@ -116,7 +116,7 @@ def _evaluated(
     def lanes(x: NDArray) -> Any:
         return Float(np.ascontiguousarray(np.broadcast_to(x, (len(mu), points)), np.float32).ravel())
 
-    u = [lanes((x + s[:, None]) % 1.0) for x, s in zip(quadrature.lattice(points).T, shift, strict=True)]
+    u = [lanes((x + s[:, None]) % 1.0) for x, s in zip(lattice_points(points).T, shift, strict=True)]
     sin = np.sqrt(1.0 - mu * mu)
     wi = Vec3(*(lanes(c[:, None]) for c in (sin * np.cos(phi), sin * np.sin(phi), mu)))
     wo, weight = _directions(wi, u, lanes(np.arange(points)[None] % _CROWDED == 0))

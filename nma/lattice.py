@@ -1,0 +1,24 @@
+"""Kronecker lattices: evenly spread points of the unit cube, for quadrature. Roberts 2018, "The Unreasonable
+Effectiveness of Quasirandom Sequences".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# For each dimension d, the root of x^(d+1) = x + 1.
+_ROOTS = {3: 1.2207440846057596, 4: 1.1673039782614187}
+
+
+def lattice_steps(dimensions: int) -> tuple[float, ...]:
+    """The step from one point of the lattice to the next, modulo 1: powers of the inverse of the root."""
+    return tuple(_ROOTS[dimensions] ** -(k + 1) for k in range(dimensions))
+
+
+def lattice_points(n: int, dimensions: int = 3) -> NDArray[np.float64]:
+    """The first `n` points of the lattice, (n, 3 or 4): 0.5 + k * lattice_steps for k = 0, 1, ..., modulo 1.
+
+    Quadratures shift them by random numbers, modulo 1, which makes their estimates unbiased.
+    """
+    return (np.arange(n)[:, None] * np.array(lattice_steps(dimensions)) + 0.5) % 1.0
