@@ -1,5 +1,8 @@
-"""Declares the parameters of each class of materials. Training, rendering, the command line and the exports read these
-declarations."""
+"""Declares the parameters of classes of materials. Training, rendering, the command line and the exports read them.
+
+This file declares `layered3` and the classes without a source. A class that is added later declares its parameters in
+the file of its source. `nma.sources.space` finds the parameters of every class.
+"""
 
 from __future__ import annotations
 
@@ -283,5 +286,3 @@ LIBRARY = ParamSpace(
         ),
     ),
 )
-
-SPACES = {space.name: space for space in (LAYERED3, MEASURED, LIBRARY)}

@@ -11,10 +11,10 @@ from material_cases import write_image
 from runtime_cases import pointer
 
 import nma.render
-from nma import materials
+from nma import materials, sources
 from nma.errors import NmaError
 from nma.native.runtime import Runtime
-from nma.params import LAYERED3, ROUNDING, SPACES, Bounds
+from nma.params import LAYERED3, ROUNDING, Bounds
 from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
@@ -189,9 +189,9 @@ def test_a_rounding_error_is_allowed_wherever_it_is_given(give, kind, way):
 
 
 @pytest.mark.parametrize("kind", ("training", "valid"))
-@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
-def test_single_precision_keeps_bounds_within_the_tolerance(space, kind):
-    for param in space.params:
+@pytest.mark.parametrize("name", sources.classes())
+def test_single_precision_keeps_bounds_within_the_tolerance(name, kind):
+    for param in sources.space(name).params:
         bounds = param.bounds(kind)
         ends = np.array(bounds, np.float32)
         assert not bounds.bad(ends).any() and not bounds.bad(ends.astype(np.float64)).any()

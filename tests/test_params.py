@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from nma import sources
 from nma.conductors import load_conductors
 from nma.errors import ParamError
-from nma.params import LAYERED3, LIBRARY, MEASURED, SPACES, Param, ParamSpace
+from nma.params import LAYERED3, LIBRARY, MEASURED, Param, ParamSpace
 
 FALSE_ALARM = 1e-3
 DRAWS = 20_000
@@ -141,7 +142,7 @@ def test_an_unknown_population_is_refused():
 
 
 def test_the_class_is_that_of_the_paper_s_table_1():
-    assert SPACES["layered3"] == LAYERED3
+    assert sources.space("layered3") == LAYERED3
     assert tuple(p.name for p in LAYERED3.params) == NAMES
     assert LAYERED3.size == 13
     assert [(s.start, s.stop) for s in LAYERED3.slices.values()] == [
@@ -272,5 +273,11 @@ def test_a_class_without_a_conductor_accepts_every_population():
 
 
 def test_classes_are_registered_by_their_names():
-    assert {LAYERED3.name, MEASURED.name, LIBRARY.name} <= set(SPACES)
-    assert all(space.name == name for name, space in SPACES.items())
+    assert {LAYERED3.name, MEASURED.name, LIBRARY.name} <= set(sources.classes())
+    assert all(sources.space(name).name == name for name in sources.classes())
+    assert all(sources.get(name).space == sources.space(name) for name in sources.names())
+
+
+def test_an_unknown_class_is_refused():
+    with pytest.raises(ParamError, match="there is no class 'paint'; there is layered3, measured, library"):
+        sources.space("paint")

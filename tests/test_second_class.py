@@ -1,59 +1,76 @@
-"""A second class of materials needs its parameters, a source and one line in each registry. No other code changes."""
+"""A second class of materials is one file, with its parameters and its source, and one line. No other code changes.
+
+The tests follow docs/how-it-is-built.md.
+"""
 
 import sys
-import types
 
 import numpy as np
 import pytest
 
 from nma import sources
 from nma.adapter import Adapter
-from nma.export import classes
-from nma.params import LAYERED3, SPACES, Param, ParamSpace
-from nma.sources.layered import Layered3
+from nma.export import FILES
+from nma.params import LAYERED3
 from nma.table import Tables
 from nma.train.recipe import CLASS, PAPER, for_class
 
-BARE = ParamSpace(
-    "bare",
-    (
-        Param("alpha", "a", "log10", 1e-2, 1.0, 1e-4, 1.0, "microfacet width"),
-        Param("tint", "t", "uniform", 0.0, 1.0, 0.0, 1.0, "colour of the medium", 3),
-    ),
-)
-MATERIAL = 'title = "Steel"\ndescription = "Bare."\nclass = "bare"\n[parameters]\nalpha = 0.2\ntint = [0.5, 0.6, 0.7]\n'
+FILE = '''
+"""A stack of layers of which only two parameters vary."""
+
+from nma.params import Param, ParamSpace
+from nma.sources.layered import Layered3
 
 
 class Bare(Layered3):
-    """A stack of layers of which only two parameters vary."""
-
-    space = BARE
+    space = ParamSpace(
+        "bare",
+        (
+            Param("alpha", "a", "log10", 1e-2, 1.0, 1e-4, 1.0, "microfacet width"),
+            Param("tint", "t", "uniform", 0.0, 1.0, 0.0, 1.0, "colour of the medium", 3),
+        ),
+    )
 
     def gather(self, columns):
         alpha, *tint = columns
         constant = lambda *values: [0.0 * alpha + value for value in values]
         metal = constant(0.2, 0.2, 0.2, 3.0, 3.0, 3.0)
         return super().gather([alpha, alpha, *constant(1.5), *metal, *tint, *constant(0.5)])
+'''
+LINE = {"bare": "bare:Bare"}
+MATERIAL = 'title = "Steel"\ndescription = "Bare."\nclass = "bare"\n[parameters]\nalpha = 0.2\ntint = [0.5, 0.6, 0.7]\n'
 
 
 @pytest.fixture
 def bare(monkeypatch, tmp_path):
-    """The path of a material file of the class `bare`, which this fixture adds to the registries."""
-    monkeypatch.setitem(SPACES, "bare", BARE)
-    module = types.ModuleType("nma.sources.bare")
-    module.Bare = Bare
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setitem(sources.CLASSES, "bare", "bare:Bare")
+    """The path of a material file of the class `bare`, whose file and line this fixture adds."""
+    folder = tmp_path / "sources"
+    folder.mkdir()
+    (folder / "bare.py").write_text(FILE)
+    monkeypatch.setattr(sources, "__path__", [*sources.__path__, str(folder)])
+    monkeypatch.setattr(sources, "CLASSES", sources.CLASSES | LINE)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "steel.toml").write_text(MATERIAL)
-    return tmp_path / "steel.toml"
+    yield tmp_path / "steel.toml"
+    sys.modules.pop("nma.sources.bare", None)
 
 
-def test_a_class_trains_with_its_own_encoding_or_with_its_plain_parameters():
+def test_a_class_trains_with_its_own_encoding_or_with_its_plain_parameters(bare):
+    space = sources.space("bare")
     assert for_class(LAYERED3) == CLASS
-    assert for_class(BARE, steps=10).encoding == "raw"
-    assert for_class(BARE, "paper") == PAPER
-    assert for_class(BARE, "single").encoding == "direction"
+    assert for_class(space, steps=10).encoding == "raw"
+    assert for_class(space, "paper") == PAPER
+    assert for_class(space, "single").encoding == "direction"
+
+
+def test_the_class_is_known_by_its_name(bare):
+    assert set(sources.classes()) == {"layered3", "measured", "library", "bare"}
+    assert sources.space("bare").name == "bare"
+
+
+def test_materials_of_the_class_are_shown(bare, nma):
+    code, out, _ = nma("materials", bare)
+    assert code == 0 and "tint" in out
 
 
 def test_simulate_takes_the_class_of_the_material(bare, nma):
@@ -65,7 +82,9 @@ def test_simulate_takes_the_class_of_the_material(bare, nma):
 
 
 def test_cpp_gets_the_parameters_of_the_class(bare):
-    assert "bare_parameters()" in classes()
+    classes, constants = (FILES[f"nma/generated/{name}.h"]() for name in ("classes", "constants"))
+    assert "bare_parameters()" in classes
+    assert "namespace bare {" in constants and "constexpr int TINT = 1;" in constants
 
 
 @pytest.mark.slow
@@ -81,9 +100,10 @@ def test_a_class_is_sampled_trained_judged_and_prepared(bare, nma):
     ):
         code, _, told = nma(*words.split())
         assert code == 0, (words, told)
+    space = sources.space("bare")
     adapter = Adapter.load("bare.safetensors")
-    assert (adapter.space, adapter.encoding) == (BARE, "raw")
+    assert (adapter.space, adapter.encoding) == (space, "raw")
     for alone in map(Adapter.load, ("alone.safetensors", "same.safetensors")):
-        assert alone.space == BARE
+        assert alone.space == space
         np.testing.assert_allclose(alone.material, [0.2, 0.5, 0.6, 0.7])
-    assert np.isfinite(adapter.numbers(BARE.sample(np.random.default_rng(0), 3), [0.2, 0.9])).all()
+    assert np.isfinite(adapter.numbers(space.sample(np.random.default_rng(0), 3), [0.2, 0.9])).all()

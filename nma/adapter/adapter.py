@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nma import network, ops
+from nma import network, ops, sources
 from nma.adapter import encoding, weights
 from nma.errors import ParamError, WeightsError
 from nma.network import Layers
 from nma.ops import Float, Vec3
-from nma.params import SPACES, ParamSpace
+from nma.params import ParamSpace
 from nma.target.blend import Blend, bounded
 from nma.target.brdf import Brdf
 from nma.target.decode import (
@@ -84,7 +84,7 @@ class Adapter:
         except (WeightsError, TypeError) as e:
             raise WeightsError(f"{path}: {e}") from None
         adapter = Adapter(
-            SPACES[header.class_name],
+            sources.space(header.class_name),
             header.encoding,
             layers,
             header.instances,

@@ -19,10 +19,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from nma import sources
 from nma.errors import WeightsError
 from nma.files import write_bytes
 from nma.network import Layers
-from nma.params import SPACES, ParamSpace
+from nma.params import ParamSpace
 
 FORMAT = 1
 # The deepest nesting of brackets that is read in the metadata. Files of trained adapters nest 4 deep.
@@ -140,11 +141,11 @@ def _check_class(path: Path, header: Header) -> None:
         raise WeightsError(
             f"{path}: format {header.format}, this version reads {FORMAT}; upgrade the package"
         )
-    space = SPACES.get(header.class_name)
-    if space is None:
+    if header.class_name not in sources.classes():
         raise WeightsError(
-            f"{path}: made for class '{header.class_name}'; this version has {', '.join(SPACES)}"
+            f"{path}: made for class '{header.class_name}'; this version has {', '.join(sources.classes())}"
         )
+    space = sources.space(header.class_name)
     keys = ("name", "size", "law", "low", "high")
     for number, declared in enumerate(describe(space)):
         theirs = header.parameters[number] if number < len(header.parameters) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nma import params, sources
 from nma.adapter import adapter, encoding, weights
-from nma.params import SPACES, ParamSpace
+from nma.params import ParamSpace
 from nma.sources import layered, layered_eval
 from nma.target import principled
 
@@ -33,8 +33,8 @@ def shared() -> str:
     parts = [_HEAD, _values(_GENERAL)]
     parts.append("// Constants of the layered source.")
     parts.append(_namespace("layered", _values(_LAYERED)))
-    parts.append("// The index of each parameter's first number in the vector of its class (nma/params.py).")
-    parts += [_namespace(name, _columns(SPACES[name])) for name in sources.names()]
+    parts.append("// The index of each parameter's first number in the vector of its class (nma/sources).")
+    parts += [_namespace(name, _columns(sources.space(name))) for name in sources.names()]
     parts.append("}  // namespace nma")
     return "\n".join(parts) + "\n"
 

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nma import sources
 from nma.conductors import load_conductors
 from nma.errors import MaterialError, ParamError, closest, either, one_line
 from nma.images.io import CHANNELS, linear
 from nma.materials.texture import Texture
-from nma.params import SPACES, Param, ParamSpace
+from nma.params import Param, ParamSpace
 
 __all__ = ["Material", "Texture", "load", "names"]
 
@@ -51,7 +52,7 @@ class Material:
     @property
     def space(self) -> ParamSpace:
         """The parameters of the material's class."""
-        return SPACES[self.class_name]
+        return sources.space(self.class_name)
 
     @property
     def textures(self) -> dict[str, Texture]:
@@ -142,12 +143,14 @@ def _parse(document: Mapping[str, Any], path: Path) -> Material:
         if not isinstance(document.get(key, ""), str):
             raise MaterialError(f"{path}: {key} is {_shown(document[key])}, but must be text in quotes")
     class_name = document["class"]
-    if class_name not in SPACES:
-        raise MaterialError(f"{path}: there is no class {_shown(class_name)}; there is {', '.join(SPACES)}")
+    if class_name not in sources.classes():
+        raise MaterialError(
+            f"{path}: there is no class {_shown(class_name)}; there is {', '.join(sources.classes())}"
+        )
     if not isinstance(document["parameters"], Mapping):
         raise MaterialError(f"{path}: 'parameters' must be a table: [parameters], then one line each")
     uv_scale = _uv_scale(document, 1.0, str(path))
-    values = _values(document["parameters"], SPACES[class_name], path, uv_scale)
+    values = _values(document["parameters"], sources.space(class_name), path, uv_scale)
     title, description = (" ".join(document.get(key, "").split()) for key in ("title", "description"))
     return Material(path.stem, title, description, class_name, values, uv_scale)
 

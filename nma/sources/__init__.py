@@ -1,21 +1,24 @@
 """The sources: models and files that say how materials look.
 
-To simulate a new class of materials, add one file to this folder and one line to `CLASSES`. To read a new kind of
-file with the values of materials, add one file and one line to `FORMATS`.
+To simulate a new class of materials, add one file to this folder, with the class's parameters and its source, and one
+line to `CLASSES`. To read a new kind of file with the values of materials, add one file and one line to `FORMATS`.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nma.errors import ParamError, SourceError, some
-from nma.sources.base import Source, Values
-from nma.sources.files import Format
+from nma.params import LAYERED3, LIBRARY, MEASURED, ParamSpace
+
+if TYPE_CHECKING:
+    from nma.sources.base import Source, Values
+    from nma.sources.files import Format
 
 # Both registries name a module of this folder and a name in it. The module is imported when it is first needed.
-# Classes that can be simulated, with their sources:
+# Classes that can be simulated, with their sources. The `space` of a source has the parameters of its class.
 CLASSES = {"layered3": "layered:Layered3"}
 # Formats of files with values, by file extension:
 FORMATS = {
@@ -24,6 +27,25 @@ FORMATS = {
     ".xml": "mitsuba_bsdf:XML",
     ".npz": "nbrdf:FORMAT",
 }
+
+
+# Parameters that are needed without a source: those of classes that cannot be simulated, and those of the shipped
+# adapters, which load without Dr.Jit. Sources import Dr.Jit.
+_SPACES = {space.name: space for space in (LAYERED3, MEASURED, LIBRARY)}
+
+
+def classes() -> tuple[str, ...]:
+    """Names of all classes: those that can be simulated, `measured` and `library`."""
+    return tuple(dict.fromkeys((*CLASSES, *_SPACES)))
+
+
+def space(name: str) -> ParamSpace:
+    """The parameters of the class `name`. Raises `ParamError` if there is no such class."""
+    if name in _SPACES:
+        return _SPACES[name]
+    if name not in CLASSES:
+        raise ParamError(f"there is no class '{name}'; there is {', '.join(classes())}")
+    return get(name).space
 
 
 def names() -> tuple[str, ...]:

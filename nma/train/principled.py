@@ -9,13 +9,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import target
+from nma import sources, target
 from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.evaluate import evaluate, tabulate_adapter
 from nma.evaluate.metrics import table_metrics
 from nma.ops import Color
-from nma.params import SPACES
 from nma.table import ISOTROPIC, Tables
 from nma.target import PRINCIPLED_PARAMS, Blend, Brdf, Principled, TargetParam
 from nma.train import loop
@@ -161,7 +160,7 @@ def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array,
 def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -> Adapter:
     """An adapter whose network consists of the output layer's bias alone."""
     size = tables.params.shape[1]
-    space = next(s for s in SPACES.values() if s.size == size)
+    space = next(s for s in map(sources.space, sources.classes()) if s.size == size)
     layers = [(np.zeros((len(raw), 1), np.float32), np.asarray(raw, np.float32))]
     return Adapter(space, "direction", layers, 1, False, CONSTANT_PARAMS, record)
 

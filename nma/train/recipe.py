@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from nma import network
+from nma import network, sources
 from nma.adapter import encoding
 from nma.errors import NmaError
-from nma.params import SPACES, ParamSpace
+from nma.params import ParamSpace
 from nma.table import ISOTROPIC, Grid
 from nma.table.quadrature import FINEST
 
@@ -178,6 +178,6 @@ def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
     `raw` if this class has no encoding.
     """
     recipe = preset(name, **changes)
-    if recipe.encoding not in SPACES:
+    if recipe.encoding not in sources.classes():
         return recipe
     return replace(recipe, encoding=space.name if space.name in encoding.ENCODERS else "raw")

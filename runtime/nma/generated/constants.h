@@ -28,7 +28,7 @@ constexpr float LEAST_DIFFUSE = 0.03f;
 
 }  // namespace layered
 
-// The index of each parameter's first number in the vector of its class (nma/params.py).
+// The index of each parameter's first number in the vector of its class (nma/sources).
 namespace layered3 {
 
 constexpr int ALPHA_TOP = 0;
