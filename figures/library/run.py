@@ -1,13 +1,15 @@
-"""A library of the 100 NBRDF-MERL materials in one small network, and its latent space (paper Fig. 12).
+"""A library of the 100 NBRDF-MERL materials in one small network, and mixtures of its latent codes (paper Fig. 12).
 
     python -m figures.library.run [--quick] [--steps N] [--data FILE] [--new FILE] [--held-out N] [--size N] [--spp N]
 
-Trains a library as `nma train-library` does, and compares each of its materials with the material's table. Then it
-learns the codes of materials that training has not seen, and renders mixtures of four materials. The networks of
-NBRDF-MERL and a measured material are not part of this repository: `--data` and `--new` say where they are. Tables,
-weights and pictures are kept in out/figures/library, so a killed run continues where it stopped. Prints library.md, and
-writes library.md, library.json and library.png beside this file. With --quick, it takes a few of Mitsuba's BSDFs and
-little training, and writes to out/figures/library.
+Trains a library as `nma train-library` does, and compares each material of the library with the material's table. Then
+learns latent codes of materials that the library was not trained on, and renders mixtures of the codes of four
+materials. The networks of NBRDF-MERL and the measured material are not part of this repository: `--data` and `--new`
+name their files. Tables, weights and metrics are kept in out/figures/library, so a killed run does not compute them
+again.
+
+Prints library.md, and writes library.md, library.json and library.png beside this file. With --quick, trains briefly on
+four of Mitsuba's BSDFs and writes to out/figures/library.
 """
 
 from __future__ import annotations
@@ -38,12 +40,12 @@ from nma.train.recipe import Recipe
 DATA = common.DATA
 NBRDF = DATA / "merl_nbrdf/merl_nbrdf_weights.npz"
 NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
-# The materials at the top left, top right, bottom left and bottom right: a metal, a paint, a matte material, a plastic.
+# The materials in the grid's corners (top left, top right, bottom left, bottom right): metal, paint, matte and plastic.
 CORNERS = ("brass", "color-changing-paint2", "pink-fabric", "green-plastic")
 CELLS = 7
-# The sheet is brighter than the pictures by this many stops. FLIP is computed from the pictures themselves.
+# The pictures in the plot are brightened by this many stops. FLIP is computed from the original pictures.
 EXPOSURE = 1.0
-# An adapter that is compared with a table runs at this many values of cos(theta_i) in each row of the table.
+# To compare an adapter with a table, the network runs at this many values of cos(theta_i) in each row of the table.
 DIRECTIONS = 16
 # Correlated multi-jittered samples, as in figures/rendered.
 SAMPLER = "multijitter"
@@ -115,7 +117,7 @@ def parse() -> argparse.Namespace:
 
 
 def write_quick(kept: Path) -> None:
-    """Writes five of Mitsuba's BSDFs to files: four to train on, and a new one."""
+    """Writes five of Mitsuba's BSDFs to files: four to train a library on, and one as the new material."""
     for name, bsdf in QUICK.items():
         path = kept / ("new.xml" if name == "new" else f"materials/{name}.xml")
         write_text(path, bsdf.replace("<bsdf", '<bsdf version="3.0.0"') + "\n")
@@ -131,7 +133,7 @@ def tabulated(members: Sequence[Member], kept: Path) -> Tables:
 def trained(
     label: str, members: Sequence[Member], tables: Tables, recipe: Recipe, kept: Path
 ) -> tuple[Library, float]:
-    """Returns the library of these materials, trained unless its file exists, and the seconds of its training."""
+    """Returns a library of the materials `members` and the seconds of its training. Trains only if no file exists."""
     path = kept / f"{label}_{recipe.steps}.safetensors"
     if not path.exists():
         record = {"data": collection.origin(members), "materials": len(members)}
@@ -148,7 +150,7 @@ def trained(
 
 
 def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]:
-    """Log loss, albedo error and noise floor of each material of the library, sorted by log loss."""
+    """Returns log loss, albedo error and noise floor of each material of the library, sorted by log loss."""
     known = Tables(library.codes.astype(np.float64), tables.values, tables.walks, tables.error)
     found = common.kept(path, lambda: common.figures(library.adapter, known, DIRECTIONS))
     wanted = ("log_loss", "albedo_error", "noise_floor")
@@ -160,7 +162,7 @@ def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]
 
 
 def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[str, Any]:
-    """Learns the code of a new material, and returns its log loss, the nearest known material and the seconds."""
+    """Learns the code of a new material. Returns the log loss, the library's nearest material, and the seconds."""
     began = time.perf_counter()
     found = training.encode(library, tables, recipe=replace(training.ENCODING, steps=steps))
     row = {"name": name, "log_loss": round(found.log_loss, 6), "nearest": found.nearest}
@@ -172,7 +174,7 @@ def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[st
 def unseen(
     members: Sequence[Member], tables: Tables, recipe: Recipe, arguments: argparse.Namespace, kept: Path
 ) -> list[dict[str, Any]]:
-    """Trains a second library without some materials, evenly chosen, and learns the codes of these materials."""
+    """Trains a second library that lacks every n-th material, and then learns the codes of the missing materials."""
     if not arguments.held_out:
         return []
     out = np.linspace(0, len(members), arguments.held_out, endpoint=False).astype(int) + 1
@@ -188,8 +190,10 @@ def unseen(
 def rendered(
     library: Library, members: Sequence[Member], arguments: argparse.Namespace, kept: Path
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Renders the CELLS x CELLS grid of mixtures and the references of its corners; returns these pictures, and for
-    each corner the FLIP of its fit and of noise alone."""
+    """Renders the CELLS x CELLS grid of mixtures and the references of its corners.
+
+    Returns these pictures, and for each corner the FLIP of the fit and the FLIP of noise alone.
+    """
     by_name = {member.name: member for member in members}
     size, many = arguments.size, arguments.reference_spp
     codes = np.stack([library.code(name) for name in arguments.corners])
@@ -214,20 +218,20 @@ def rendered(
 
 
 def fit(library: Library, code: NDArray, kept: Path) -> dict[str, Any]:
-    """The BSDF `nma` for a code of the library."""
+    """Returns the BSDF `nma` for a latent code of the library."""
     path = kept / "mixture.safetensors"
     library.material(code).save(path)
     return {"type": "nma", "adapter": str(path)}
 
 
 def measured(member: Member) -> dict[str, Any]:
-    """The BSDF `values`, which renders a material itself."""
+    """Returns the BSDF `values`, which renders the member's own values without an adapter."""
     chosen = {"material": member.material} if member.material else {}
     return {"type": "values", "file": str(member.path)} | chosen
 
 
 def markdown(data: dict[str, Any]) -> str:
-    """The tables of README.md, in Markdown."""
+    """Returns the tables of README.md, in Markdown."""
     losses = [row["log_loss"] for row in data["fits"]]
     albedos = [row["albedo_error"] for row in data["fits"]]
     worst = data["fits"][-1]
@@ -240,7 +244,7 @@ def markdown(data: dict[str, Any]) -> str:
         f"| log loss | {np.mean(losses):.5f} | {np.median(losses):.5f} | {max(losses):.5f} ({worst['name']}) |",
         f"| albedo error | {np.mean(albedos):.5f} | {np.median(albedos):.5f} | {max(albedos):.5f} |",
         "",
-        "Codes of new materials:",
+        "Latent codes of new materials:",
         "",
         "| material | log loss | nearest of the library | its log loss | seconds |",
         "|---|---|---|---|---|",
@@ -251,7 +255,7 @@ def markdown(data: dict[str, Any]) -> str:
         f"| {row['seconds']} |"
         for row in found
     ]
-    lines += ["", "Corners of the grid, against their references:", ""]
+    lines += ["", "Pictures of the four materials in the grid's corners, compared with their references:", ""]
     lines += ["| material | FLIP | HDR-FLIP | FLIP of noise | HDR-FLIP of noise |", "|---|---|---|---|---|"]
     keys = ("flip_ldr", "flip_hdr", "noise_flip_ldr", "noise_flip_hdr")
     lines += [
@@ -261,7 +265,7 @@ def markdown(data: dict[str, Any]) -> str:
 
 
 def sheet(pictures: dict[str, Any], flips: list[dict[str, Any]], path: Path) -> None:
-    """Draws the grid. Beside each corner are the reference and, next to it, the FLIP of the fit."""
+    """Draws the grid of mixtures. Each corner's reference and the FLIP of its fit are drawn beside the corner."""
     figure = Figure(figsize=(1.4 * (CELLS + 2), 1.4 * CELLS))
     axes = figure.subplots(CELLS, CELLS + 2)
     figure.subplots_adjust(left=0.003, right=0.997, bottom=0.003, top=0.997, wspace=0.03, hspace=0.03)

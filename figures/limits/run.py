@@ -1,12 +1,14 @@
-"""What limits the class adapters: they are compared with fits of several targets to single, unseen materials.
+"""What limits the accuracy of class adapters: comparison with fits to single materials, with several targets.
 
     python -m figures.limits.run [--quick] [--materials N]
 
-A fit is trained on its own material, so its remaining error is the error of the target. A class adapter with the same
-target has a larger error; the difference comes from the network, the data and the optimiser. The materials are the
-first ones of the set "range", which is in random order. Each is fitted to its reference and evaluated on the same
-reference. Finished materials are kept in out/figures/limits.
-Writes limits.json and limits.png beside this file; with --quick, short fits to two materials, to out/figures/limits.
+A fit is trained on the material that it is evaluated on, so its remaining error comes from the target. A class adapter
+with the same target has a larger error; the difference comes from the network, the data and the optimiser. The
+materials are the first --materials of the set "range", which is in random order. Each material is fitted to its
+reference and evaluated on the same reference. The metrics of finished materials are kept in out/figures/limits.
+
+Writes limits.json and limits.png beside this file. With --quick, makes short fits to two materials and writes to
+out/figures/limits.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
 SET = "range"
-# The targets that are fitted. The first is the target of the class adapters.
+# The targets of the fits. The first target is also the target of the class adapters.
 TARGETS: dict[str, dict[str, Any]] = {
     "fit, two instances": {"target": "principled"},
     "fit, two stretched": {"target": "stretched"},
@@ -53,14 +55,14 @@ def main() -> None:
 
 
 def contenders(reference: nma.Tables, number: int, arguments: Namespace) -> dict:
-    """The figures of one material, kept in a file: of the shipped adapters, the fits and the reference's noise."""
+    """Returns the metrics of adapters, fits and noise for one material, from a file if the file exists."""
     stored = common.ROOT / "out/figures/limits" / f"{number}-{len(reference.params)}-{arguments.steps}.json"
     table = reference[number : number + 1]
     return common.kept(stored, partial(compete, number, table, arguments), arguments.quick)
 
 
 def compete(number: int, table: nma.Tables, arguments: Namespace) -> dict:
-    """Computes the figures that `contenders` keeps."""
+    """Computes the metrics that `contenders` returns."""
     row: dict = {"params": [round(float(x), 5) for x in table.params[0]]}
     for name in nma.shipped()[::-1]:
         row[name], row["noise"] = figures(nma.Adapter.load(name), table)
@@ -76,20 +78,20 @@ def fit(table: nma.Tables, recipe: Recipe) -> dict[str, float]:
 
 
 def figures(adapter: nma.Adapter, table: nma.Tables) -> tuple[dict[str, float], dict[str, float]]:
-    """The figures of the adapter, and the figures that a perfect adapter would have."""
+    """Returns the adapter's metrics, and the metrics that a perfect adapter would have."""
     found = nma.evaluate_adapter(adapter, table).mean
     mine = {name: round(found[name], 6) for name in FIGURES}
     return mine, {"log_loss": round(found["noise_floor"], 6), "albedo_error": 0.0}
 
 
 def summary(rows: list[dict]) -> dict[str, dict[str, float]]:
-    """The means of all figures over the materials, by model."""
+    """Returns the metrics of every model, averaged over the materials."""
     names = [name for name in rows[0] if name != "params"]
     return {n: {f: round(float(np.mean([r[n][f] for r in rows])), 6) for f in FIGURES} for n in names}
 
 
 def plot(rows: list[dict], path: Path) -> None:
-    """Draws the log loss of every model for every material."""
+    """Plots the log loss of every model for every material."""
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     axes = figure.add_subplot(ylabel="log loss (eq. 7)", xlabel="materials, by the class adapter's log loss")
     for name in (name for name in rows[0] if name != "params"):

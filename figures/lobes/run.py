@@ -1,10 +1,13 @@
-"""Lobes of layered materials, fitted with one Principled BRDF and with a blend of two that follows wi (paper Fig. 2).
+"""Lobes of layered materials, fitted with one constant Principled BRDF and with a blend of two (paper Fig. 2).
 
     python -m figures.lobes.run [--quick] [MATERIAL ...]
 
-Both targets are fitted to the same table of 64 M walks, and compared with an independent table of 64 M walks. The plot
-shows bin averages of f cos(theta_o) in the plane of incidence. Writes lobes.json and lobes.png beside this file; with
---quick, one material, few walks and few steps, to out/figures/lobes.
+The parameters of the blend depend on wi. The single BRDF and the blend are fitted to the same table of 64 M walks, and
+compared with an independent table of 64 M walks. The plot shows bin averages of f cos(theta_o) in the plane of
+incidence.
+
+Writes lobes.json and lobes.png beside this file. With --quick, fits one material with few walks and few steps, and
+writes to out/figures/lobes.
 """
 
 from __future__ import annotations
@@ -25,19 +28,19 @@ from nma.train.recipe import preset
 from nma.train.run import fit_material
 
 MATERIALS = ("copper-purple-medium", "beetle-green")
-ANGLES = (20, 50, 75)  # of wi, in degrees
-# The paper's targets, with 11 numbers of the Principled BRDF for each instance.
+ANGLES = (20, 50, 75)  # angles of incidence, in degrees
+# The paper's targets. Each instance has the 11 parameters of the Principled BRDF.
 VARIANTS = {
     "single": {"instances": 1, "directional": False, "target": "principled"},
     "blended + ωi": {"instances": 2, "directional": True, "target": "principled"},
 }
-# The plot is cut off at CUT times the value of the PEAK_BINS-th brightest bin.
+# Values above CUT times the value of the PEAK_BINS-th brightest bin are cut off in the plot.
 CUT, PEAK_BINS = 4.0, 6
 COLOURS = ("#d62728", "#2ca02c", "#1f5fd0")
 
 
 class Fit(NamedTuple):
-    """A material's reference table (40, 40, 40, 3), and the table (of the same shape) and figures of each variant."""
+    """A material's reference table (40, 40, 40, 3), and the table (40, 40, 40, 3) and metrics of each variant."""
 
     reference: NDArray
     tables: dict[str, NDArray]
@@ -56,7 +59,7 @@ def main() -> None:
 
 
 def fit(name: str, quick: bool) -> Fit:
-    """Fits every variant to the same table, and compares it with a reference from an independent random stream."""
+    """Fits every variant to one table, and compares each fit with a reference from an independent random stream."""
     source, vector = nma.source("layered3"), nma.load_material(name).vector()
     walks = 4_000_000 if quick else common.REFERENCE_WALKS
     seen = nma.tabulate(source, vector[None], walks, stream_keys(0, [0]), error=False)
@@ -79,9 +82,9 @@ def fit(name: str, quick: bool) -> Fit:
 
 
 def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
-    """A slice of a table (theta_i, theta_o, phi, 3) in the plane of incidence, for an angle of wi in degrees.
+    """Slices a table (theta_i, theta_o, phi, 3) in the plane of incidence, for an angle of incidence in degrees.
 
-    Returns the angles of wo [radians], positive on the side of the mirror direction, and the values (angles, 3).
+    Returns the angles theta_o [radians], positive on the side of the mirror direction, and the values (angles, 3).
     """
     bins = table.shape[1]
     theta = np.arccos((np.arange(bins) + 0.5) / bins)
@@ -92,13 +95,13 @@ def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
 
 
 def plane_errors(table: NDArray, reference: NDArray) -> dict[str, float]:
-    """The mean absolute error over the plotted bins [1/sr], for each angle."""
+    """Returns the mean absolute error over the bins in the plane of incidence [1/sr], for each angle."""
     errors = {a: np.abs(in_plane(table, a)[1] - in_plane(reference, a)[1]).mean() for a in ANGLES}
     return {f"{angle} degrees": round(float(error), 5) for angle, error in errors.items()}
 
 
 def plot(fits: dict[str, Fit], path: Path) -> None:
-    """Draws the lobes: a row for each material and variant, a column for each angle."""
+    """Draws the lobes, with a row for each material and variant and a column for each angle."""
     rows = [(name, label) for name in fits for label in VARIANTS]
     figure = Figure(figsize=(11, 1.7 * len(rows) + 0.7), layout="constrained")
     axes = figure.subplots(len(rows), len(ANGLES), squeeze=False)
@@ -115,8 +118,11 @@ def plot(fits: dict[str, Fit], path: Path) -> None:
 
 
 def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
-    """Draws one half disc. Radii are square roots of the values, so that low lobes are visible. Both variants have the
-    same scale."""
+    """Draws the lobe of one material, variant and angle in a half disc.
+
+    Radii are square roots of the values, so that weak lobes are visible. The half discs of both variants have the same
+    scale.
+    """
     theta, reference = in_plane(fit.reference, angle)
     across, up = np.sin(theta)[:, None], np.cos(theta)[:, None]
     ours = in_plane(fit.tables[label], angle)[1]
@@ -124,7 +130,7 @@ def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
     for values, style in zip((reference, ours), styles, strict=True):
         for x, y, colour in zip((across * np.sqrt(values)).T, (up * np.sqrt(values)).T, COLOURS, strict=True):
             ax.plot(x, y, color=colour, **style)
-    # The peak of a sharp coat is a few bins wide and far above everything else, so it is cut off.
+    # The peak of a sharp coat is a few bins wide and far above all other values, so the peak is cut off.
     peak = max(in_plane(t, angle)[1].max() for t in (fit.reference, *fit.tables.values()))
     top = 1.05 * np.sqrt(min(peak, CUT * np.sort(reference.max(axis=1))[-PEAK_BINS]))
     scale(ax, top)
@@ -133,7 +139,7 @@ def draw(ax: Axes, fit: Fit, label: str, angle: float) -> None:
 
 
 def scale(ax: Axes, top: float) -> None:
-    """Draws the frame of a half disc of the radius `top`, with rings at round values and rays every 30 degrees."""
+    """Draws the frame of a half disc of the radius `top`, with rings at fixed values and rays every 30 degrees."""
     half = np.linspace(-np.pi / 2, np.pi / 2, 181)
     rings = [t for t in (0.01, 0.05, 0.2, 1, 5, 20, 100) if 0.02 * top**2 < t < top**2]
     for radius in (top, *np.sqrt(rings)):

@@ -1,13 +1,15 @@
-"""Fits to single materials, measured and analytic, isotropic and anisotropic, against other models (paper Fig. 13).
+"""Fits to single materials (measured and analytic, isotropic and anisotropic), and two other models (paper Fig. 13).
 
     python -m figures.measured.run [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
 
-Fits a 3x32 network to each material, as `nma fit` does, and compares the fit with the material itself: at 20,000 random
-pairs of directions and in a picture. Two other models are compared at the same pairs: the best constant Principled
-BRDF, and the NBRDF networks that Sztrajman et al. 2021 fitted to RGL's measurements. RGL's files and the NBRDF networks
-are not part of this repository. `--data` names the folder that has them, in `rgl` and `rgl_nbrdf`; materials without a
-file are left out. Writes measured.md, measured.json and measured.png beside this file; with --quick and little
-training, to out/figures/measured.
+Fits a 3x32 network to each material, as `nma fit` does, and compares the fit with the material at 20,000 random pairs
+of directions and in a picture. Two other models are compared with the material at the same pairs of directions: the
+best constant Principled BRDF, and the NBRDF networks that Sztrajman et al. 2021 fitted to RGL's measurements. The
+measurements and the NBRDF networks are not part of this repository. They are read from the folders `rgl` and
+`rgl_nbrdf` in the folder `--data`; materials without a file are left out.
+
+Writes measured.md, measured.json and measured.png beside this file. With --quick, trains briefly on two materials and
+writes to out/figures/measured.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ from nma.train.principled import CONSTANT, fit_constant
 
 DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")
-# Ranges of both cosines. NBRDF's published errors hold from .05 on: grazing measurements are hardest to fit.
+# Ranges of cos(theta_i) and cos(theta_o), by the ending of the metrics' names. The NBRDF networks reach
+# their published errors for cosines above .05, because grazing measurements are the hardest to fit.
 RANGES = {"": (0.02, 1.0), " from .05": (0.05, 1.0)}
 TIMED_PAIRS = 1 << 18
 SAMPLER = "multijitter"
@@ -65,7 +68,7 @@ BRUSHED = {
 
 
 class Material(NamedTuple):
-    """A material's source, the BSDF that renders the source itself, and its NBRDF network, if there is one."""
+    """A material's source, the BSDF that renders the source without an adapter, and the NBRDF network (or None)."""
 
     name: str
     source: Values
@@ -114,7 +117,7 @@ def parse() -> argparse.Namespace:
 
 
 def materials(data: Path) -> list[Material]:
-    """The materials: RGL's measurements whose files exist, then the analytic ones."""
+    """Returns the materials: first the RGL measurements whose files exist, then the analytic materials."""
     found = []
     for name in RGL:
         path, networks = data / f"rgl/{name}_rgb.bsdf", data / "rgl_nbrdf/rgl-isotropic_nbrdf_weights.npz"
@@ -136,7 +139,7 @@ def materials(data: Path) -> list[Material]:
 
 
 def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, float]:
-    """Returns the adapter that `nma fit` makes for the material, and the seconds of the fit, with compilation."""
+    """Returns the adapter that `nma fit` makes for the material, and the seconds of the fit, including compilation."""
     recipe = recipe_for(material.source, steps=steps)
     path = kept / f"{slug(material)}_{recipe.steps}.safetensors"
     if not path.exists():
@@ -152,7 +155,7 @@ def fitted(material: Material, steps: int | None, kept: Path) -> tuple[Adapter, 
 def alternatives(
     material: Material, adapter: Adapter, constant_steps: int, kept: Path
 ) -> dict[str, tuple[Values, int]]:
-    """The fit and the other models of the material, by name, each with its number of parameters."""
+    """Returns the fit and the other models of the material, by name, each with its number of parameters."""
     found: dict[str, tuple[Values, int]] = {
         "3x32 fit": (AdapterValues(adapter), network.parameters(adapter.layers))
     }
@@ -161,7 +164,7 @@ def alternatives(
     if material.source.isotropic:
         path = kept / f"{slug(material)}_constant_{constant_steps}.safetensors"
         if not path.exists():
-            # The committed results were fitted without the albedo term.
+            # The albedo term is off because the results in this folder were fitted without this term.
             recipe = replace(CONSTANT, steps=constant_steps, albedo=0.0)
             fit_constant(tabulate_values(material.source), recipe).adapter.save(path)
         constant = Adapter.load(path)
@@ -170,8 +173,8 @@ def alternatives(
 
 
 def judged(material: Material, models: dict[str, tuple[Values, int]]) -> list[dict[str, Any]]:
-    """Returns a row for each model: its number of parameters, its time per pair, and its figures against the material
-    in each range of directions."""
+    """Returns a row for each model: number of parameters, time per pair of directions, and metrics in each range of
+    cosines."""
     times = nanoseconds([model for model, _ in models.values()])
     rows = []
     for (name, (model, parameters)), ns in zip(models.items(), times, strict=True):
@@ -188,8 +191,10 @@ def slug(material: Material) -> str:
 
 
 def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
-    """The time of each model for a pair of directions: TIMED_PAIRS pairs at once on all cores, best of several
-    repetitions. The models take turns, and compilation is not counted."""
+    """Returns the nanoseconds of each model per pair of directions, without compilation.
+
+    A repetition evaluates TIMED_PAIRS pairs with every model on all cores. The shortest time of each model counts.
+    """
     rng = np.random.default_rng(0)
     lanes = [dr.auto.Float(rng.random(TIMED_PAIRS).astype(np.float32)) for _ in range(4)]
 
@@ -213,8 +218,11 @@ def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
 def rendered(
     material: Material, adapter: Adapter, kept: Path, arguments: argparse.Namespace
 ) -> tuple[list[Any], dict[str, float]]:
-    """Renders the material twice and its fit once. Returns three pictures (the material, the fit and the map of their
-    FLIP), and the FLIP of the fit and of noise alone."""
+    """Renders the material twice and its fit once.
+
+    Returns three pictures (the material, the fit, and the map of FLIP between them), the FLIP of the fit, and the FLIP
+    of noise alone.
+    """
     path = kept / f"{slug(material)}_rendered.safetensors"
     adapter.save(path)
     images = []
@@ -235,12 +243,12 @@ def rendered(
 
 
 def flip_picture(errors: np.ndarray) -> np.ndarray:
-    """A picture of a FLIP map (height, width), 0 .. 1: bytes (height, width, 3) in the colours of FLIP's authors."""
+    """Returns a FLIP map (height, width) with values 0 .. 1 as a picture of bytes, in the colours of FLIP's authors."""
     return (colormaps["magma"](np.clip(errors, 0.0, 1.0))[..., :3] * 255.0).astype(np.uint8)
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The tables of README.md, in Markdown."""
+    """Returns the tables of README.md, in Markdown."""
     lines = ["| material | model | log loss | AE | SMAPE | log loss from .05 | parameters | ns a pair |"]
     lines += ["|---|---|---|---|---|---|---|---|"]
     for row in rows:
@@ -261,7 +269,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def means(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of a table with the mean log losses of each model; `rows` are the materials with an NBRDF network."""
+    """Returns the lines of a table of mean log losses by model; `rows` are the materials with an NBRDF network."""
     if not rows:
         return []
     lines = [

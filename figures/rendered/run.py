@@ -1,14 +1,16 @@
-"""Rendered error of the shipped adapters and of a single instance, over samples per pixel (paper Table 2, FLIP).
+"""Rendered error of the shipped adapters and of the variant "single" by samples per pixel (paper Table 2, FLIP).
 
     python -m figures.rendered.run [--quick] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
         [--single WEIGHTS] [--only SUBJECT ...]
 
-Every picture of few samples differs from its reference by noise. So the adapters are compared with a converged
-simulation at more and more samples per pixel. A second simulation is compared in the same way: its error is noise only,
-and shows how much of an adapter's error is noise. The script takes about two hours of one core. It keeps its pictures
-in out/figures/rendered, so a killed run continues where it stopped, and processes with different --only can share the
-work. Prints the tables of README.md and writes rendered.json, rendered.png and materials.png beside this file; with
---quick, of few small pictures, to out/figures/rendered.
+The error of a picture with few samples per pixel is mostly noise. Therefore the adapters are compared with a converged
+simulation at an increasing number of samples per pixel. A second simulation is compared with the converged simulation
+in the same way. Its error is only noise, and shows how much of an adapter's error is noise. The script takes about two
+hours on one core. The pictures are kept in out/figures/rendered, so a killed run continues where it stopped, and
+processes with different --only can share the work.
+
+Prints the tables of README.md, and writes tables.md, rendered.json, rendered.png and materials.png beside this file.
+With --quick, renders a few small pictures and writes to out/figures/rendered.
 """
 
 from __future__ import annotations
@@ -34,21 +36,22 @@ from nma.images.sheet import Row, contact_sheet
 from nma.render.load import material_bsdf
 
 SIMULATION, AGAIN, SINGLE = "reference", "simulation again", "single"
-# From the paper's Table 2: the FLIP of blended + omega_i, and its ratio to that of single.
+# From the paper's Table 2: the FLIP of the variant "blended + omega_i", and its ratio to the FLIP of the variant
+# "single".
 PAPER = {"flip_hdr": (0.0432, 0.89), "flip_ldr": (0.0352, 0.91)}
-# The variant "single", as figures/variants trains it with its first seed.
+# Weights of the variant "single", trained by figures/variants with its first seed.
 SINGLE_WEIGHTS = common.ROOT / "out/figures/variants/single_8000_6000-steps_seed-0.safetensors"
-# Correlated multi-jittered samples (Kensler 2013). At 64 samples, they reduce the adapters' variance to a sixth of that
-# with independent samples, and the simulation's variance to two thirds.
+# Correlated multi-jittered samples (Kensler 2013). Compared with independent samples at 64 samples per pixel, they
+# reduce the adapters' variance to a sixth, and the simulation's variance to two thirds.
 SAMPLER = "multijitter"
 FIRST_LEVEL = 64
-# The most samples of the second simulation; enough to see how its noise falls.
+# The second simulation has at most this many samples per pixel, enough to see how its noise falls.
 AGAIN_SPP = 256
 ROWS = 4
 
 
 class Subject(NamedTuple):
-    """What renders the materials: an adapter with its weights, or the simulation (`weights` is None); and its seed."""
+    """An adapter, or the simulation if `weights` is None, with its seed and its largest number of samples per pixel."""
 
     name: str
     weights: Path | str | None
@@ -62,7 +65,7 @@ class Subject(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The start of its pictures' file names. It contains a hash of the weights, so new weights are rendered
+        """The prefix of the pictures' file names. It contains a hash of the weights, so new weights are rendered
         again."""
         if self.weights is None:
             return f"layered_seed-{self.seed}"
@@ -120,7 +123,7 @@ def subjects(arguments: argparse.Namespace) -> list[Subject]:
 
 
 def levels(spp: int) -> list[int]:
-    """The numbers of samples per pixel at which pictures are kept: FIRST_LEVEL, doubled until `spp`."""
+    """Returns the numbers of samples per pixel at which pictures are kept: FIRST_LEVEL, and its doubles up to `spp`."""
     found = [min(FIRST_LEVEL, spp)]
     while found[-1] < spp:
         found.append(min(2 * found[-1], spp))
@@ -130,7 +133,7 @@ def levels(spp: int) -> list[int]:
 def gallery(
     subject: Subject, materials: list[nma.materials.Material], size: int, kept: Path
 ) -> list[NDArray[np.float32]]:
-    """The pictures (levels, size, size, 3) of each material. Pictures without a file are rendered first."""
+    """Returns the pictures (levels, size, size, 3) of each material, and renders those whose file does not exist."""
     found, bar = [], progress("materials/min")
     with bar:
         task = bar.add_task(subject.name, total=len(materials), rate="", note=f"{subject.spp} spp")
@@ -147,7 +150,7 @@ def gallery(
 
 
 def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
-    """The pictures of lower levels that an earlier run with fewer samples has rendered."""
+    """Returns the pictures of lower levels, if an earlier run with fewer samples per pixel has rendered them."""
     for spp in reversed(levels(subject.spp)[:-1]):
         shorter = path.with_name(path.name.replace(f"_{subject.spp}-spp_", f"_{spp}-spp_"))
         if shorter.exists():
@@ -158,7 +161,7 @@ def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
 def converge(
     subject: Subject, bsdf: dict[str, Any], size: int, found: list[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """Pictures (levels, size, size, 3) of more and more samples. Each level reuses the samples of the level before.
+    """Renders pictures (levels, size, size, 3). Each level adds samples to the picture of the level before.
 
     Args:
         found: the pictures of the first levels, if an earlier run has rendered them.
@@ -180,7 +183,7 @@ def report(
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
-    """Compares the pictures, prints the tables, and writes figures, tables, plot and sheet."""
+    """Compares the pictures with the references, prints the tables, and writes metrics, tables, plot and sheet."""
     references = [levels_of_it[-1] for levels_of_it in pictures[SIMULATION]]
     steps = levels(arguments.spp)
     errors = {
@@ -221,7 +224,7 @@ def mean(rows: list[dict[str, float]], metric: str) -> float:
 
 
 def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.Namespace) -> str:
-    """The tables in Markdown: all metrics at the most samples per pixel, then FLIP over samples per pixel."""
+    """Returns tables in Markdown: all metrics at the most samples per pixel, then FLIP by samples per pixel."""
     most = arguments.spp
     lines = [
         f"{arguments.materials} materials, {arguments.resolution} x {arguments.resolution} pixels; reference:"
@@ -238,7 +241,7 @@ def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.
     ]
     for metric, (value, ratio) in PAPER.items():
         steps = levels(most)
-        lines += ["", f"{metric} over samples per pixel (paper: {value}, {ratio} of single):", ""]
+        lines += ["", f"{metric} by samples per pixel (paper: {value}, {ratio} of the variant single):", ""]
         lines += [
             "| | " + " | ".join(map(str, steps)) + " | of single |",
             "|---|" + "---|" * (len(steps) + 1),
@@ -252,7 +255,7 @@ def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.
 
 
 def plot(means: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
-    """Draws FLIP over samples per pixel, with the paper's values as lines."""
+    """Plots FLIP against samples per pixel, with the paper's values as lines."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     for axes, (metric, (paper, _)) in zip(figure.subplots(1, 2), PAPER.items(), strict=True):
         for name, by_spp in means.items():
@@ -271,7 +274,7 @@ def sheet(
     materials: list[nma.materials.Material],
     path: Path,
 ) -> None:
-    """Writes a sheet of pictures of ROWS materials, from the worst to the median by the best adapter's HDR-FLIP."""
+    """Writes a sheet with pictures of ROWS materials: from the largest to the median HDR-FLIP of the best adapter."""
     shown = [name for name in flips if name != AGAIN]
     best = nma.shipped()[-1]
     chosen = studio.worst_to_median(flips[best]["flip_hdr"], ROWS)
