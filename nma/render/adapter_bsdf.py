@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from nma import target
 from nma.adapter import Adapter, shipped, weights_file
@@ -36,8 +36,8 @@ def define() -> type:
 
     mi: Any = mitsuba  # its types change with the variant
 
-    attached = mi.Float(0.0)  # has a gradient wherever gradients are not suspended
-    dr.enable_grad(attached)
+    probe = mi.Float(0.0)  # has a gradient wherever gradients are not suspended
+    dr.enable_grad(probe)
 
     class Nma(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
@@ -48,7 +48,7 @@ def define() -> type:
             )
             self.inputs = of_adapter(self.adapter, props)
             self._curves = self._make_curves()
-            self._recorded = _Recorded()
+            self._last = _LastBrdf()
             super().__init__(props)
             self._declare(*([mi.BSDFFlags.Anisotropic] if self.adapter.anisotropic else []))
 
@@ -63,29 +63,29 @@ def define() -> type:
             return f"Nma[\n  adapter = {self.name},\n  class = {self.adapter.space.name},\n{self.inputs}\n]"
 
         def eval_pdf(self, ctx, si, wo, active=True):
-            brdf, active = self._prepare(ctx, si, active)
-            return self._eval_pdf(ctx, brdf, si, wo, active)
+            brdf, front = self._prepare(ctx, si, active)
+            return self._eval_pdf(ctx, brdf, si, wo, front)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            brdf, active = self._prepare(ctx, si, active)
-            return self._sample(ctx, brdf, si, sample1, sample2, active)
+            brdf, front = self._prepare(ctx, si, active)
+            return self._sample(ctx, brdf, si, sample1, sample2, front)
 
         def eval_pdf_sample(self, ctx, si, wo, sample1, sample2, active=True):
-            brdf, active = self._prepare(ctx, si, active)
-            found = self._eval_pdf(ctx, brdf, si, wo, active)
-            return *found, *self._sample(ctx, brdf, si, sample1, sample2, active)
+            brdf, front = self._prepare(ctx, si, active)
+            found = self._eval_pdf(ctx, brdf, si, wo, front)
+            return *found, *self._sample(ctx, brdf, si, sample1, sample2, front)
 
-        def _eval_pdf(self, ctx, brdf: Brdf, si, wo, active):
+        def _eval_pdf(self, ctx, brdf: Brdf, si, wo, front):
             value, pdf = brdf.eval_pdf(vec3(si.wi), vec3(wo))
             if self._from_light(ctx):
-                value = self._towards_camera(si, wo, active)
-            return mi.Color3f(*value) & active, pdf & active
+                value = self._towards_camera(si, wo, front)
+            return mi.Color3f(*value) & front, pdf & front
 
-        def _sample(self, ctx, brdf: Brdf, si, sample1, sample2, active):
+        def _sample(self, ctx, brdf: Brdf, si, sample1, sample2, front):
             wo, value, pdf = brdf.sample(vec3(si.wi), sample1, sample2.x, sample2.y)
             if self._from_light(ctx):
-                value = self._towards_camera(si, mi.Vector3f(*wo), active & (pdf > 0))
-            return self._sampled(wo, pdf, over(value, pdf), active)
+                value = self._towards_camera(si, mi.Vector3f(*wo), front & (pdf > 0))
+            return self._sampled(wo, pdf, over(value, pdf), front)
 
         def _from_light(self, ctx) -> bool:
             """Whether the path comes from the light and the BRDF is not reciprocal."""
@@ -102,14 +102,14 @@ def define() -> type:
             brdf = self._brdf(turned, active, active & (wo.z > 0))
             return brdf.eval(vec3(wo), vec3(si.wi)) * (wo.z / si.wi.z)
 
-        def _albedo(self, si, active) -> Color:
-            brdf = self._brdf(si, active, active)
+        def _albedo(self, si, front) -> Color:
+            brdf = self._brdf(si, front, front)
 
             def draw(k, *u):
                 _, value, pdf = brdf.sample(vec3(si.wi), *u)
                 return select(pdf > 0, over(value, pdf), 0.0)
 
-            return mean_of_samples(draw, ALBEDO_POINTS, active)
+            return mean_of_samples(draw, ALBEDO_POINTS, front)
 
         def _make_curves(self) -> Curves | None:
             """The curves that replace the network; None if more than cos(theta_i) varies, and the network must run."""
@@ -118,27 +118,23 @@ def define() -> type:
             return Curves(self.adapter, self.inputs.columns())
 
         def _prepare(self, ctx, si, active) -> tuple[Brdf, Any]:
-            """The BRDF at `si`, and which lanes see the front."""
+            """The BRDF at `si`, and `front`: the active lanes that see the front of the surface."""
             front = self._front(ctx, si, active)
             return self._brdf(si, active, front), front
 
         def _brdf(self, si, active, front) -> Brdf:
-            """The BRDF at `si`.
-
-            At a point Mitsuba calls `eval_pdf` and then `sample`; it does not call `eval_pdf_sample` of Python BSDFs.
-            The second call reuses the BRDF of the first call, if both are in the same basic block.
-            """
+            """The BRDF at `si`: from the curves, from the call before this one, or else from the network."""
             self.inputs.check()
             wi = Vec3(si.wi.x, si.wi.y, dr.clip(si.wi.z, MIN_COS, 1.0))
             if self._curves is not None:
                 return self._curves.at(wi, self.inputs.columns() if self._curves.slopes else [], front)
-            asked = dr.detach(mi.SurfaceInteraction3f(si)), active
-            if brdf := self._recorded.take(asked, dr.grad_enabled(attached)):
+            query = _Query(dr.detach(mi.SurfaceInteraction3f(si)), active, dr.grad_enabled(probe))
+            if brdf := self._last.take(query):
                 return brdf
             brdf = self.adapter.prepare(self.inputs.columns(si, front), wi, front)
-            derived = dr.grad_enabled(target.numbers(brdf.blend, self.adapter.target))
-            if si.wi.z.state == dr.VarState.Symbolic and not derived:
-                self._recorded.leave(asked, dr.grad_enabled(attached), brdf)
+            recording = si.wi.z.state == dr.VarState.Symbolic
+            if recording and not dr.grad_enabled(target.numbers(brdf.blend, self.adapter.target)):
+                self._last.keep(query, brdf)
             return brdf
 
     return Nma
@@ -156,31 +152,47 @@ def _loaded(name_or_path: str, stamp: tuple[int, int] | None) -> Adapter:
     return Adapter.load(name_or_path)
 
 
-class _Recorded:
-    """The BRDF that a call prepared while Dr.Jit recorded it, for the next call in the same basic block.
+class _Query(NamedTuple):
+    """A request for the BRDF at a point: the interaction without its derivatives, and the active lanes."""
 
-    In another block the variables of the BRDF may not exist: Dr.Jit records all callables of a virtual call with the
-    same arguments, each in a new scope. So `leave` opens a new scope, and `take` succeeds only in that scope. The
-    arguments are kept, because Dr.Jit reuses the indices of variables that are freed. A BRDF with derivatives is never
-    kept, because the next pass would follow them to variables that no longer exist. Frozen functions do not look into
-    this class, because they must not find symbolic variables.
+    si: Any
+    active: Any
+    gradients: bool  # false inside `dr.suspend_grad`
+
+    def identity(self) -> list[int]:
+        """Two queries are the same if these numbers are: they have the same variables and lie in the same scope."""
+        from nma.jit import dr
+
+        scope = dr.detail.scope(dr.backend_v(self.si.wi))
+        return [self.gradients, scope, *dr.detail.collect_indices((self.si, self.active))]
+
+
+class _LastBrdf:
+    """Keeps the BRDF of one call for the next call, so that the network runs once at a shading point.
+
+    Why: at a point, Mitsuba calls `eval_pdf` and then `sample`. It does not call `eval_pdf_sample` of BSDFs in Python.
+    Without this class, the kernel that Dr.Jit records would contain the network twice.
+
+    What: the BRDF, whose numbers are variables of the kernel that is being recorded, and its query. The query keeps
+    its own variables alive, because Dr.Jit gives the indices of freed variables to new ones. A BRDF with derivatives
+    must not be kept: the next pass would follow them to variables that no longer exist.
+
+    How long: until the next call. That call takes the BRDF if it asks the same query in the same scope, and otherwise
+    drops it. In another scope the BRDF's variables may not exist: Dr.Jit records all BSDFs of a scene with the same
+    arguments, each in a new scope. `keep` opens a new scope too, so only the code directly after it can take the BRDF.
+
+    Frozen functions do not look into this class, because they must not find variables of a kernel under recording.
     """
 
     def __init__(self) -> None:
-        self._left: tuple[list[int], Any, Brdf] | None = None
+        self._kept: tuple[list[int], _Query, Brdf] | None = None
 
-    def leave(self, asked: Any, attached: bool, brdf: Brdf) -> None:
+    def keep(self, query: _Query, brdf: Brdf) -> None:
         from nma.jit import dr
 
-        dr.detail.new_scope(dr.backend_v(asked[0].wi))
-        self._left = _key(asked, attached), asked, brdf
+        dr.detail.new_scope(dr.backend_v(query.si.wi))
+        self._kept = query.identity(), query, brdf
 
-    def take(self, asked: Any, attached: bool) -> Brdf | None:
-        left, self._left = self._left, None
-        return left[2] if left and left[0] == _key(asked, attached) else None
-
-
-def _key(asked: Any, attached: bool) -> list[int]:
-    from nma.jit import dr
-
-    return [attached, dr.detail.scope(dr.backend_v(asked[0].wi)), *dr.detail.collect_indices(asked)]
+    def take(self, query: _Query) -> Brdf | None:
+        kept, self._kept = self._kept, None
+        return kept[2] if kept and kept[0] == query.identity() else None

@@ -51,24 +51,24 @@ def define() -> type:
 
         def pdf(self, ctx, si, wo, active=True):
             with dr.suspend_grad():
-                stack, active = self._prepare(ctx, si, active)
-                return dr.select(active & (wo.z > 0), layered_eval.pdf(stack, vec3(si.wi), vec3(wo)), 0.0)
+                stack, front = self._prepare(ctx, si, active)
+                return dr.select(front & (wo.z > 0), layered_eval.pdf(stack, vec3(si.wi), vec3(wo)), 0.0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             with dr.suspend_grad():
-                stack, active = self._prepare(ctx, si, active)
-                return self._estimate(stack, si, wo, active)
+                stack, front = self._prepare(ctx, si, active)
+                return self._estimate(stack, si, wo, front)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             with dr.suspend_grad():
-                stack, active = self._prepare(ctx, si, active)
+                stack, front = self._prepare(ctx, si, active)
                 draw = self._draw if blended(self) else self._walk
-                wo, weight = draw(stack, si, (sample1, sample2.x, sample2.y), active)
+                wo, weight = draw(stack, si, (sample1, sample2.x, sample2.y), front)
                 pdf = layered_eval.pdf(stack, vec3(si.wi), vec3(wo))
-                return self._sampled(vec3(wo), pdf, vec3(weight), active & dr.any(weight > 0))
+                return self._sampled(vec3(wo), pdf, vec3(weight), front & dr.any(weight > 0))
 
         def _prepare(self, ctx, si, active) -> tuple[Stack, Any]:
-            """The stack at `si`, and which lanes see its front."""
+            """The stack at `si`, and `front`: the active lanes that see the front of the surface."""
             self.inputs.check()
             front = self._front(ctx, si, active)
             return self._stack(si, front), front

@@ -70,9 +70,9 @@ def define() -> type:
             return mi.Color3f(*value), pdf
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            active = self._front(ctx, si, active)
-            wo, pdf, weight = self._draw(vec3(si.wi), (sample1, sample2.x, sample2.y), active)
-            return self._sampled(wo, pdf, weight, active)
+            front = self._front(ctx, si, active)
+            wo, pdf, weight = self._draw(vec3(si.wi), (sample1, sample2.x, sample2.y), front)
+            return self._sampled(wo, pdf, weight, front)
 
         def _albedo(self, si, active) -> Color:
             return mean_of_samples(lambda k, *u: self._draw(vec3(si.wi), u, active)[2], ALBEDO_POINTS, active)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from nma.ops import Color, Float, Vec3
-from nma.target import blend as lobes
+from nma.target import blend
 from nma.target.blend import Blend
 from nma.target.plane import Plane
 
@@ -22,19 +22,19 @@ class Brdf(NamedTuple):
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
         """f cos(theta_o) [1/sr], zero below the horizon."""
-        return lobes.eval(self.blend, self._enter(wi), self._enter(wo))
+        return blend.eval(self.blend, self._enter(wi), self._enter(wo))
 
     def pdf(self, wi: Vec3, wo: Vec3) -> Float:
         """The density of `sample` per solid angle of `wo` [1/sr]."""
-        return lobes.pdf(self.blend, self._enter(wi), self._enter(wo))
+        return blend.pdf(self.blend, self._enter(wi), self._enter(wo))
 
     def eval_pdf(self, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
         """The results of `eval` and `pdf`, for the cost of one call."""
-        return lobes.eval_pdf(self.blend, self._enter(wi), self._enter(wo))
+        return blend.eval_pdf(self.blend, self._enter(wi), self._enter(wo))
 
     def sample(self, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
         """A direction `wo` from three uniform numbers in [0, 1), its value and its density (0: an invalid sample)."""
-        wo, value, pdf = lobes.sample(self.blend, self._enter(wi), u_lobe, u1, u2)
+        wo, value, pdf = blend.sample(self.blend, self._enter(wi), u_lobe, u1, u2)
         return (wo if self.plane is None else self.plane.leave(wo)), value, pdf
 
     def _enter(self, v: Vec3) -> Vec3:
