@@ -70,16 +70,18 @@ def test_an_image_too_large_for_memory_is_refused_by_its_header(tmp_path, monkey
     path = bomb(tmp_path / f"bomb.{kind}", kind)
     assert path.stat().st_size < 2000
     monkeypatch.setattr(mi, "Bitmap", None)
-    with pytest.raises(ImageError, match=r"bomb.* claims (100000 x 100000|65000 x 65000) pixels; at most"):
+    with pytest.raises(
+        ImageError, match=r"bomb.* has (100000 x 100000|65000 x 65000) pixels according to its header"
+    ):
         read_image(path)
 
 
 def test_huge_textures_and_environment_maps_are_refused(tmp_path):
     texture = {"texture": str(bomb(tmp_path / "bomb.png", "png"))}
     material = materials.load("wet-nickel").changed({"alpha_top": texture}, "--set")
-    with pytest.raises(NmaError, match="bomb.png claims"):
+    with pytest.raises(NmaError, match="bomb.png has .* pixels"):
         material.values["alpha_top"].read()
-    with pytest.raises(NmaError, match="bomb.hdr claims"):
+    with pytest.raises(NmaError, match="bomb.hdr has .* pixels"):
         preview_scene({"type": "diffuse"}, envmap=bomb(tmp_path / "bomb.hdr", "hdr"))
 
 
@@ -90,7 +92,7 @@ def test_scene_files_that_name_a_huge_image_are_refused(tmp_path):
     (tmp_path / "scene.xml").write_text(
         f'<scene version="3.0.0"><bsdf type="diffuse">{texture}</bsdf></scene>'
     )
-    with pytest.raises(NmaError, match="bomb.png claims"):
+    with pytest.raises(NmaError, match="bomb.png has .* pixels"):
         load_scene(tmp_path / "scene.xml")
 
 

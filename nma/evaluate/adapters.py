@@ -18,22 +18,24 @@ from nma.lattice import lattice_points
 from nma.table import ISOTROPIC, Grid, Tables, quadrature
 from nma.table.walks import bin_index
 
-# The network runs at _DIRECTIONS values of cos(theta_i) in each row of the table. At each of them the target is
-# evaluated at _POINTS directions wo in each bin, and at _SAMPLES directions wo drawn from its own lobes.
+# A row of the table is a bin of cos(theta_i). The network runs at _DIRECTIONS cosines in each row. At each of these
+# cosines the target is evaluated for _POINTS directions wo in each bin of wo, and for _SAMPLES directions wo drawn from
+# the target's own lobes.
 _DIRECTIONS = 32
 _POINTS = 4
 _SAMPLES = 512
-# Where the target's density is far above this [1/sr], a lobe is too sharp for points in a bin, and samples are used.
+# The target's sampling density of wo [1/sr] at which half of f cos(theta_o) counts as sharp. Where the density is far
+# higher, a lobe is too narrow for a few points per bin, so samples of the lobe are used.
 _SHARP = 10.0
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The error figures of each material, and their means.
+    """The error figures of each material, and the mean of each figure over the materials.
 
-    `integration_error` and `albedo_integration_error` estimate the error of the adapter's own bin averages, in log loss
-    and in albedo, from two independent estimates. `estimated_error` is true if the references have no standard errors
-    of their own.
+    The adapter's bin averages are numerical integrals. `integration_error` (in log loss) and `albedo_integration_error`
+    estimate the errors of these integrals, from two integrations with different points. `estimated_error` is true if
+    the reference tables have no standard errors, so that the errors were estimated from the number of walks.
     """
 
     materials: list[dict[str, float]]
@@ -52,14 +54,16 @@ def tabulate_adapter(
     grid: Grid = ISOTROPIC,
     directions: int | None = None,
 ) -> NDArray[np.float32]:
-    """The adapter's bin averages (n, theta_i, theta_o, phi, 3). Each `shift` in [0, 1) gives a different set of points.
+    """The means of the adapter's f cos(theta_o) over the bins of a table: (n, theta_i, theta_o, phi, 3).
 
-    `directions` is the number of cos(theta_i) per row (32 by default): the time and the precision are in proportion to
-    it. Raises `ParamError` for parameters outside the training range; with `clamp`, moves them to the range.
+    Each `shift` in [0, 1) gives a different set of integration points. `directions` is the number of cosines
+    cos(theta_i) per row of the table (32 by default): more cosines take more time and make the means more precise. With
+    `clamp`, parameters outside the training range are moved to the end of the range; without `clamp`, such parameters
+    raise `ParamError`.
     """
     if adapter.anisotropic:
         raise TableError(
-            "an anisotropic adapter has no isotropic table; compare it by pairs (nma.evaluate.pairs)"
+            "an anisotropic adapter has no isotropic table; compare it at pairs of directions (nma.evaluate.pairs)"
         )
     params = adapter.check(params, clamp)
     strata = np.arange(grid.theta_i * (directions or _DIRECTIONS))
@@ -69,7 +73,10 @@ def tabulate_adapter(
 
 
 def table_log_loss(adapter: Adapter, params: NDArray, table: NDArray, directions: int | None = None) -> float:
-    """The log loss (eq. 7) of one material (columns,) against its table; integrated once, so faster than `evaluate`."""
+    """The log loss (eq. 7) of the adapter at one material, whose parameters are `params` (columns,), against `table`.
+
+    The adapter is integrated only once, so this function is faster than `evaluate`.
+    """
     own = tabulate_adapter(adapter, params[None], directions=directions)[0]
     return metrics.table_metrics(own, table, np.zeros_like(own))["log_loss"]
 
@@ -77,10 +84,12 @@ def table_log_loss(adapter: Adapter, params: NDArray, table: NDArray, directions
 def _tabulate(
     numbers: NDArray, mu: NDArray, shift: float, adapter: Adapter, grid: Grid
 ) -> NDArray[np.float32]:
-    """The table of one material, from its target parameters (theta_i * directions, size) at the cosines `mu`.
+    """The table of one material.
 
-    f cos(theta_o) is split into a sharp and a smooth part, by a function of the target's density. Samples of the target
-    integrate the sharp part, whatever its width. Points in every bin integrate the smooth part.
+    `numbers` (theta_i * directions, size) are the target's parameters at the cosines `mu`. `_sharpness`, a function of
+    the target's sampling density, splits f cos(theta_o) into a sharp and a smooth part. The sharp part is integrated
+    with samples of the target's lobes, so the lobes may be arbitrarily narrow. The smooth part is integrated with
+    points in every bin.
     """
     curves = [dr.auto.Float(np.ascontiguousarray(c)) for c in numbers.T]
     cosines, seed = dr.auto.Float(mu), dr.opaque(dr.auto.UInt32, int(shift * 2**24))
@@ -93,7 +102,7 @@ def _tabulate(
 def _by_points(
     curves: list[Any], cosines: Any, seed: Any, adapter: Adapter, grid: Grid
 ) -> NDArray[np.float64]:
-    """The smooth part (bins, 3), averaged over points in every bin."""
+    """The smooth part of f cos(theta_o), averaged over points in every bin: (bins, 3)."""
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     directions = len(cosines) // grid.theta_i
     bins = dr.arange(UInt32, grid.bins)
@@ -125,7 +134,7 @@ def _by_points(
 def _by_samples(
     curves: list[Any], cosines: Any, seed: Any, adapter: Adapter, grid: Grid
 ) -> NDArray[np.float64]:
-    """The sharp part (bins, 3), from samples of the target's own lobes."""
+    """The sharp part of f cos(theta_o), averaged over each bin with samples of the target's lobes: (bins, 3)."""
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     lane = dr.arange(UInt32, len(cosines) * _SAMPLES)
     at, k = lane // _SAMPLES, lane % _SAMPLES
@@ -140,13 +149,13 @@ def _by_samples(
     directions = len(cosines) // grid.theta_i
     index = bin_index(at // directions, UInt32(0), wo, grid)
     dr.eval(index, *value)
-    # NumPy adds the samples in a fixed order, so that results are reproducible.
+    # The samples are summed with NumPy, which has a fixed order of addition, so that results are reproducible.
     sums = [np.bincount(index.numpy(), c.numpy(), grid.bins) for c in value]
     return np.stack(sums, axis=-1) / (directions * _SAMPLES * grid.solid_angle)
 
 
 def _sharpness(pdf: Any) -> Any:
-    """The share, 0 to 1, of a value that belongs to the sharp part, given the target's density."""
+    """The fraction (0 to 1) of f cos(theta_o) in the sharp part, where the target's sampling density is `pdf`."""
     x = pdf * (1.0 / _SHARP)
     return 1.0 - 1.0 / (1.0 + x * x)
 
@@ -158,14 +167,16 @@ def evaluate(
     *,
     clamp: bool = False,
 ) -> Evaluation:
-    """Compares the adapter with reference tables over the paper's bins. `progress` gets the number of materials done.
+    """Compares the adapter with reference tables on the paper's grid of bins.
 
-    Raises `TableError` for tables of other bins, and `ParamError` for materials for which the adapter was not trained.
-    With `clamp`, parameters are moved to the training range instead.
+    `progress` is called with the number of materials evaluated so far. Raises `TableError` if the tables have another
+    grid, and `ParamError` for materials outside the adapter's training range. With `clamp`, the parameters of such
+    materials are moved to the end of the range instead.
     """
     if reference.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
-            f"evaluation needs isotropic tables {ISOTROPIC.shape}, the reference has {reference.values.shape[1:]}"
+            f"evaluation needs isotropic tables of shape {ISOTROPIC.shape}, but the reference has tables of shape "
+            f"{reference.values.shape[1:]}"
         )
     if not len(reference.params):
         raise TableError("the reference holds no material")
@@ -176,7 +187,8 @@ def evaluate(
         mean = 0.5 * (halves[0] + halves[1])
         materials.append(metrics.table_metrics(mean, reference.values[n], _error(reference, n)))
         spread = metrics.table_metrics(halves[0], halves[1], np.zeros_like(mean))
-        # On average, the error of the mean of two estimates is half of their difference.
+        # On average, the error of the mean of two independent estimates is half of the difference between the
+        # estimates.
         spreads.append((0.5 * spread["log_loss"], 0.5 * spread["albedo_error"]))
         progress(n + 1)
     log_loss, albedo = np.mean(spreads, axis=0)
@@ -186,7 +198,10 @@ def evaluate(
 
 
 def _error(reference: Tables, n: int) -> NDArray:
-    """The standard error per bin of a reference. If the reference has none, counting statistics give it."""
+    """The standard error of each bin of the reference table of material `n`.
+
+    If the reference has no standard errors, they are estimated from the number of walks.
+    """
     if reference.error is not None:
         return reference.error[n]
     walks = int(reference.walks[n])

@@ -1,4 +1,4 @@
-"""Error figures of tables: means over bins and RGB, of f cos(theta_o) [1/sr], for one material at a time.
+"""Error figures of a material's table. They compare f cos(theta_o) [1/sr] and are means over bins and RGB.
 
 `a` is the adapter's table and `b` the reference, both (..., theta_i, theta_o, phi, 3).
 """
@@ -11,29 +11,35 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-# Keeps relative errors finite in dark bins [1/sr].
+# Added to the denominators of relative errors, so that they stay finite in dark bins [1/sr].
 EPS = 1e-2
 
 
 def _normal_means(n: int) -> NDArray[np.float64]:
-    """The mean of a standard normal variable in each of `n` equally likely intervals of its positive half: (n,)."""
+    """The means (n,) of `n` equally likely intervals of the positive half of the standard normal distribution."""
     normal = NormalDist()
     densities = [normal.pdf(normal.inv_cdf(0.5 + 0.5 * k / n)) for k in range(n)] + [0.0]
     return -2.0 * n * np.diff(densities)
 
 
-# Values that stand for a standard normal variable in the noise floor; their mean magnitude is exact.
+# `noise_floor` takes these values and their negatives as samples of a standard normal variable. The mean of their
+# magnitudes equals the mean magnitude of the variable.
 _NORMAL = _normal_means(16)
 
 FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")
 
 
 def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
-    """All figures of one material, by their names in `FIGURES`; `error` is the reference's standard error per bin.
+    """All figures of one material, by their names in `FIGURES`; `error` is the standard error of each bin of `b`.
 
-    log_loss: eq. 7. ae: |a - b|. smape: 2 |a - b| / (|a| + |b| + EPS). mape: |a - b| / (b + EPS). mrse: (a - b)^2 /
-    (b^2 + EPS). psnr: 10 log10(peak^2 / mean (a - b)^2) dB, peak the reference's brightest bin. albedo_error: mean over
-    theta_i and RGB of the difference of directional albedos. noise_floor: log loss that a perfect model would have.
+    - log_loss: the mean of |log(1 + a) - log(1 + b)| (eq. 7).
+    - ae: the mean of |a - b|.
+    - smape: the mean of 2 |a - b| / (|a| + |b| + EPS).
+    - mape: the mean of |a - b| / (b + EPS).
+    - mrse: the mean of (a - b)^2 / (b^2 + EPS).
+    - psnr: 10 log10(peak^2 / mean of (a - b)^2) dB, where peak is the reference's brightest bin.
+    - albedo_error: the mean absolute difference of the directional albedos, over theta_i and RGB.
+    - noise_floor: the log loss that a perfect model would have, because the reference is noisy.
     """
     a, b = a.astype(np.float64), b.astype(np.float64)
     difference = np.abs(a - b)
@@ -49,7 +55,7 @@ def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
 
 
 def value_metrics(a: NDArray, b: NDArray) -> dict[str, float]:
-    """The figures that need no bins: log_loss, ae and smape of any values of f cos(theta_o)."""
+    """The figures that can be computed without bins, from any values of f cos(theta_o): log_loss, ae and smape."""
     difference = np.abs(a - b)
     return {
         "log_loss": float(np.mean(np.abs(np.log1p(a) - np.log1p(b)))),
@@ -59,7 +65,10 @@ def value_metrics(a: NDArray, b: NDArray) -> dict[str, float]:
 
 
 def noise_floor(b: NDArray, error: NDArray) -> float:
-    """The mean over bins of E|log(1 + b + e) - log(1 + b)|, where e is normal with standard deviation `error`."""
+    """The mean over bins of the expected |log(1 + b + e) - log(1 + b)|, where the noise e is normally distributed.
+
+    The standard deviation of the noise is `error`.
+    """
     b, error = b.astype(np.float64), error.astype(np.float64)
     base = np.log1p(b)
     total = 0.0
@@ -69,7 +78,7 @@ def noise_floor(b: NDArray, error: NDArray) -> float:
 
 
 def counting_error(b: NDArray, walks: int, solid_angle: float, rows: int) -> NDArray[np.float64]:
-    """An upper bound of the standard error per bin, from the number of walks, as if every throughput were 1."""
+    """An upper bound of each bin's standard error, from the number of walks: every throughput is assumed to be 1."""
     return np.sqrt(np.maximum(b, 0.0).astype(np.float64) * rows / (walks * solid_angle))
 
 

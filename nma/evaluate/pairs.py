@@ -1,7 +1,8 @@
-"""Compares two sources at random pairs of directions. Figures of single materials are computed this way.
+"""Compares two sources at random pairs of directions.
 
-cos(theta_i) and cos(theta_o) are independent and uniform in a range; azimuths are uniform. There are no bins, so that
-anisotropic sources, and models trained on different data, can be compared.
+cos(theta_i) and cos(theta_o) are independent and uniform in a range; azimuths are uniform. The comparison needs no
+bins, so the sources may be anisotropic, or models that were trained on different data. The error figures of adapters
+for single materials are computed in this way.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ class Pairs:
 
     @staticmethod
     def draw(count: int = PAIRS, *, seed: int = 0, cosines: tuple[float, float] = COSINES) -> Pairs:
-        """`count` random pairs, determined by the seed."""
+        """Draws `count` random pairs. The same seed gives the same pairs."""
         rng = np.random.default_rng((seed, 0x9A12))
         mu_i, mu_o = rng.uniform(*cosines, (2, count))
         phi_i, phi_o = rng.uniform(0.0, 2.0 * np.pi, (2, count))
         return Pairs(mu_i, phi_i, mu_o, phi_o)
 
     def values(self, source: Values) -> NDArray[np.float64]:
-        """f cos(theta_o) [1/sr] of a source, (n, 3)."""
+        """f cos(theta_o) [1/sr] of a source at these pairs of directions, (n, 3)."""
         value = source.eval(direction(self.mu_i, self.phi_i), direction(self.mu_o, self.phi_o))
         return np.stack([np.broadcast_to(c.numpy(), len(self.mu_i)) for c in value], axis=-1).astype(
             np.float64
@@ -44,6 +45,6 @@ class Pairs:
 
 
 def compare(model: Values, reference: Values, pairs: Pairs | None = None) -> dict[str, float]:
-    """Log loss, AE and SMAPE of f cos(theta_o) (`nma.evaluate.metrics`), as means over pairs and RGB."""
+    """The figures log_loss, ae and smape (`nma.evaluate.metrics`) of f cos(theta_o), as means over pairs and RGB."""
     pairs = pairs or Pairs.draw()
     return metrics.value_metrics(pairs.values(model), pairs.values(reference))

@@ -1,1 +1,1 @@
-"""Pictures: reading and writing them, metrics, contact sheets."""
+"""Images: reading and writing image files, error metrics, and contact sheets."""

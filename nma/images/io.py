@@ -1,4 +1,4 @@
-"""Reads and writes image files: EXR for linear values, PNG to look at. A file is written completely or not at all."""
+"""Reads image files, and writes images as EXR (linear values) or PNG (for viewing), completely or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nma.errors import NmaError, one_line
 from nma.files import whole, write_bytes
 from nma.images.size import MOST_PIXELS, header_size
 
-# The channels of an image, in the order of a pixel's values, and its colour channels.
+# The names of an image's channels, in the order in which a pixel stores them. The first three are the colour channels.
 CHANNELS = ("r", "g", "b", "a")
 COLOUR = CHANNELS[:3]
 
@@ -24,11 +24,11 @@ class ImageError(NmaError, ValueError):
 
 
 def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
-    """The image as a float32 array, after a check that it is (height, width, 3) and finite.
+    """Converts an image to float32, after a check that its shape is (height, width, 3) and that all values are finite.
 
     Raises:
-        ImageError: the shape is wrong, or values are NaN or infinite; the message counts these pixels and names the
-            first.
+        ImageError: the shape is wrong, or values are NaN or infinite. The message has the number of such pixels and the
+            position of the first.
     """
     array = np.asarray(image, dtype=np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
@@ -45,14 +45,15 @@ def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
 def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -> NDArray[np.float32]:
     """Converts linear sRGB radiance to display values (..., 3) in 0..1.
 
-    Let x = 2^exposure * radiance and s = `shoulder`. Values up to s stay as they are. Larger values approach 1 as s +
-    (1 - s) (1 - exp(-(x - s) / (1 - s))), which has the same slope at s. The sRGB transfer curve (IEC 61966-2-1)
-    follows. Each channel is treated alone, so very bright colours turn white. `shoulder` = 1 clips, as metrics need.
+    Let x = 2^exposure * radiance and s = `shoulder`. The function first compresses x: a value up to s stays as it is,
+    and a larger value becomes s + (1 - s) (1 - exp(-(x - s) / (1 - s))), which has slope 1 at s and approaches 1. Then
+    it applies the sRGB transfer curve (IEC 61966-2-1). Each channel is converted by itself, so very bright colours
+    become white. With `shoulder` = 1, values above 1 are clipped, as error metrics require.
 
     Args:
-        image: (..., 3) linear sRGB, any value; negative values become 0.
-        exposure: in stops: radiance is multiplied by 2^exposure.
-        shoulder: linear value, in (0, 1], where compression starts.
+        image: linear sRGB (..., 3); negative values become 0.
+        exposure: exposure in stops; radiance is multiplied by 2^exposure.
+        shoulder: linear value, in (0, 1], at which compression starts.
     """
     if not 0.0 < shoulder <= 1.0:
         raise ImageError(f"tonemap: shoulder {shoulder} must lie in (0, 1]")
@@ -77,7 +78,9 @@ def linear(srgb: ArrayLike) -> NDArray[np.float64]:
 
 
 def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 0.8) -> Path:
-    """Tone-map a linear image (height, width, 3) and write it as an 8-bit sRGB PNG. Bytes are written unchanged.
+    """Tone-maps a linear image (height, width, 3) and writes it as an 8-bit sRGB PNG.
+
+    An image of bytes is written unchanged.
 
     Raises:
         ImageError: the shape is wrong, or values are not finite.
@@ -93,10 +96,10 @@ def write_png(path: str | Path, image: ArrayLike, *, exposure: float = 0.0, shou
 
 
 def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) -> Path:
-    """Write linear values (height, width) or (height, width, channels) as a 32-bit float EXR.
+    """Writes linear values (height, width) or (height, width, channels) as a 32-bit float EXR.
 
-    Three channels are written as RGB and four as RGBA; `channels` gives them other names. Values that are not finite
-    are kept, so that the file can show what went wrong.
+    Three channels are written as RGB and four as RGBA; `channels` replaces these channel names. NaN and infinite values
+    are written as they are, so that the file shows which pixels are wrong.
     """
     import mitsuba as mi
 
@@ -113,9 +116,10 @@ def write_exr(path: str | Path, image: ArrayLike, channels: Sequence[str] = ()) 
 
 
 def load_bitmap(path: str | Path) -> Any:
-    """The file as a Mitsuba bitmap.
+    """Reads a file as a Mitsuba bitmap.
 
-    Raises `RuntimeError` where Mitsuba cannot decode it, and the errors of `check_size`.
+    Raises `RuntimeError` if Mitsuba cannot decode the file, and `ImageError` if the file cannot be opened or the image
+    is too large.
     """
     import mitsuba as mi
 
@@ -125,21 +129,24 @@ def load_bitmap(path: str | Path) -> Any:
 
 
 def check_size(path: str | Path) -> None:
-    """Raises `ImageError` for images of too many pixels. It reads only the header, before the image takes memory."""
+    """Raises `ImageError` if an image has too many pixels.
+
+    Only the file's header is read, which needs little memory.
+    """
     try:
         size = header_size(path)
     except OSError as error:
         raise ImageError(f"image {path} cannot be read: {error.strerror}") from None
     if size and size[0] * size[1] > MOST_PIXELS:
         raise ImageError(
-            f"image {path} claims {size[0]} x {size[1]} pixels; at most {MOST_PIXELS:,} are read, 16384 x 8192 for "
-            "example: make it smaller"
+            f"image {path} has {size[0]} x {size[1]} pixels according to its header, more than the {MOST_PIXELS:,} "
+            "(for example 16384 x 8192) that can be read; make the image smaller"
         )
 
 
 @contextmanager
 def _second_thread() -> Iterator[None]:
-    """Gives Dr.Jit a second thread while this context lasts: with one thread, Mitsuba's EXR code would wait forever."""
+    """Gives Dr.Jit a second thread in this context, because with one thread Mitsuba's EXR code would wait forever."""
     import drjit as dr
 
     if dr.thread_count() > 1:
@@ -153,10 +160,10 @@ def _second_thread() -> Iterator[None]:
 
 
 def read_image(path: str | Path) -> NDArray[np.float32]:
-    """Read an image as linear float32 (height, width, 3): EXR, HDR and PFM as stored, PNG and JPEG converted from sRGB.
+    """Reads an image as linear float32 (height, width, 3): EXR, HDR, PFM as stored, PNG and JPEG converted from sRGB.
 
-    Grey is copied to all three channels, and alpha is dropped. From an EXR file with several layers, the first layer in
-    colour is read.
+    Grey is copied to all three channels, and alpha is dropped. Of an EXR file with several layers, only the first
+    colour layer is read.
 
     Raises:
         ImageError: the file does not exist or cannot be decoded.
@@ -175,7 +182,10 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
 
 
 def coloured_layer(bitmap: Any) -> Any:
-    """The bitmap's first RGB layer, or else its first layer in grey or XYZ, or else the bitmap itself."""
+    """The bitmap's first RGB layer.
+
+    If there is none, its first grey or XYZ layer; if there is none either, the bitmap.
+    """
     import mitsuba as mi
 
     kinds = mi.Bitmap.PixelFormat

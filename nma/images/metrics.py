@@ -1,4 +1,4 @@
-"""Measures the error of a rendered image against a reference. For sheets of pictures see `nma.images.sheet`.
+"""Measures the error of a rendered image against a reference. (`nma.images.sheet` makes contact sheets.)
 
 `a` is the test image and `b` the reference, both linear sRGB. Errors are means over pixels and channels, as fractions,
 not percent:
@@ -10,8 +10,9 @@ not percent:
     flip_ldr   mean FLIP of Andersson et al. 2020 on display values, 67 pixels per degree (flip-evaluator)
     flip_hdr   mean HDR-FLIP of Andersson et al. 2021 on linear values, ACES, exposures chosen from the reference
 
-Display values come from `nma.images.io.tonemap` at `ldr_exposure`, with plain clipping. Equal images give ssim 1, and 0
-for every other metric. SSIM and FLIP need the extra `compare`.
+`nma.images.io.tonemap` computes the display values, at exposure `ldr_exposure` and with values above 1 clipped. For two
+equal images ssim is 1 and every other metric is 0. ssim, flip_ldr and flip_hdr need the packages of the extra `compare`
+(`pip install '.[compare]'`).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from nma.images.io import ImageError, as_image, tonemap
 
 Image = NDArray[np.float32]
 EPS = 0.01
-SMALLEST = 11  # pixels; the width of ssim's window
+SMALLEST = 11  # the least width and height in pixels: the width of ssim's window
 METRICS = ("l1", "l2", "mape", "smape", "mrse", "ssim", "flip_hdr", "flip_ldr")
 
 
@@ -61,12 +62,12 @@ def check_size(size: tuple[int, int]) -> None:
     """Raises `ImageError` for images that are too small for ssim."""
     if min(size) < SMALLEST:
         raise ImageError(
-            f"images of {size[0]} x {size[1]} pixels are too small for ssim; it needs {SMALLEST} x {SMALLEST}"
+            f"images of {size[0]} x {size[1]} pixels are too small for ssim, which needs {SMALLEST} x {SMALLEST}"
         )
 
 
 def errors(test: ArrayLike, reference: ArrayLike, *, eps: float = EPS) -> dict[str, float]:
-    """The five plain errors l1, l2, mape, smape and mrse, in double precision; see the top of the module."""
+    """The errors l1, l2, mape, smape and mrse, which the module's docstring defines, in double precision."""
     a, b = (image.astype(np.float64) for image in _pair(test, reference))
     difference = np.abs(a - b)
     return {
@@ -83,8 +84,9 @@ def flip_map(test: ArrayLike, reference: ArrayLike, *, hdr: bool = False, exposu
 
     Args:
         test, reference: (height, width, 3) linear sRGB; negative values count as 0.
-        hdr: whether to compute HDR-FLIP, the maximum over a range of exposures chosen from the reference, or LDR-FLIP.
-        exposure: in stops, for LDR-FLIP only.
+        hdr: if true, compute HDR-FLIP, the maximum over a range of exposures that is chosen from the reference; if
+            false, compute LDR-FLIP.
+        exposure: exposure in stops, for LDR-FLIP only.
     """
     flip_evaluator = _package("flip_evaluator")
     a, b = _pair(test, reference)
@@ -101,15 +103,15 @@ def flip_map(test: ArrayLike, reference: ArrayLike, *, hdr: bool = False, exposu
 def difference_image(
     test: ArrayLike, reference: ArrayLike, *, kind: str = "flip", scale: float = 1.0, exposure: float = 0.0
 ) -> NDArray[np.uint8]:
-    """A picture of where two images differ, (height, width, 3) bytes, ready for a PNG.
+    """Shows where two images differ, as an image of bytes (height, width, 3).
 
     Args:
         test, reference: (height, width, 3) linear sRGB.
-        kind: "flip" shows LDR-FLIP in the colour map magma (black 0, pale yellow 1). "absolute" shows, in magma, the
-            mean of |a - b| over the channels. "signed" shows the mean of a - b over the channels, blue where the test
-            is darker and red where it is brighter.
-        scale: the difference that gets the last colour of the map.
-        exposure: in stops, for "flip" only.
+        kind: "flip" shows LDR-FLIP in the colour map magma, from black (0) to pale yellow (`scale`). "absolute" shows
+            the mean of |a - b| over the channels in the same colour map. "signed" shows the mean of a - b over the
+            channels, blue where the test image is darker and red where the test image is brighter.
+        scale: the difference that is shown in the last colour of the colour map.
+        exposure: exposure in stops, for "flip" only.
 
     Raises:
         ImageError: the kind is unknown, the shapes differ, or values are NaN or infinite.
@@ -137,7 +139,10 @@ def _pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
 
 
 def ensure_packages(ssim: bool = True) -> None:
-    """Raises `MissingDependencyError` if a package that the metrics need is missing. Call it before long renderings."""
+    """Raises `MissingDependencyError` if a package is missing that the metrics need.
+
+    Call this function before a long rendering, so that the fault is found early.
+    """
     for name in ("flip_evaluator", *(["skimage.metrics"] if ssim else [])):
         _package(name)
 
@@ -164,9 +169,10 @@ def _ssim(a: Image, b: Image) -> float:
 
 
 def _exposures(reference: Image) -> dict[str, float]:
-    """The range of exposures for HDR-FLIP: empty for ordinary references, so that the package chooses it.
+    """The range of exposures for HDR-FLIP. If the result is empty, the package flip_evaluator chooses the range.
 
-    For references that are black or of one colour the package would end the process; they get a single exposure.
+    The package would end the process for a reference that is black or of one colour, so for such a reference the range
+    is a single exposure.
     """
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
     brightest, middle = float(luminance.max()), float(np.median(luminance))

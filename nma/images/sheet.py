@@ -20,8 +20,9 @@ TITLE_SIZE, TEXT_SIZE, CAPTION_SIZE, GAP, MARGIN = 22, 15, 13, 14, 26
 class Row(NamedTuple):
     """One row of a contact sheet.
 
-    `images`: one for each column, (height, width, 3). Linear float32 is tone-mapped here; bytes are shown as they are.
-    `label`: the row's name. `captions`: text under each image, of one line or more; there may be fewer than images.
+    `label`: the row's name. `images`: one image (height, width, 3) for each column. Images in linear float32 are
+    tone-mapped; images of bytes are shown as they are. `captions`: a text of one or more lines for each image; the last
+    images of a row may have no caption.
     """
 
     label: str
@@ -40,16 +41,16 @@ def contact_sheet(
     exposure: float = 0.0,
     shoulder: float = 0.8,
 ) -> NDArray[np.uint8]:
-    """Lay out a grid of pictures and write it as a PNG.
+    """Lays out a grid of pictures and writes the grid as a PNG.
 
     Args:
-        path: the PNG; written atomically.
+        path: the PNG file, which is written atomically.
         rows: see `Row`; all images have the same size.
         columns: the heading of each column.
-        title: a line on top.
+        title: a line of text above the pictures.
         table: rows of text cells below the pictures. The first row is the heading; the first column is left-aligned.
-        note: grey text at the bottom, about the tone mapping or the machine for example.
-        exposure, shoulder: tone mapping of linear images, see `nma.images.io.tonemap`.
+        note: grey text at the bottom, for example about the tone mapping or the machine.
+        exposure, shoulder: how linear images are tone-mapped (see `nma.images.io.tonemap`).
 
     Returns:
         The sheet as (height, width, 3) bytes.
@@ -129,7 +130,7 @@ def _cell_width(width: int, rows: Sequence[Row], columns: Sequence[str]) -> int:
 def _draw_row(
     sheet: Image.Image, top: float, row: Row, images: list[NDArray[np.uint8]], cell: int, label_height: int
 ) -> None:
-    """Draws the row's label, its images side by side, and a caption under each."""
+    """Draws the row's label, the row's images side by side, and a caption under each image."""
     draw = ImageDraw.Draw(sheet)
     _text(draw, (MARGIN, top), row.label, TEXT_SIZE)
     top += label_height
@@ -193,7 +194,7 @@ def _width(text: str, size: int, *, bold: bool = False) -> int:
 
 @lru_cache(maxsize=16)
 def _font(size: int, bold: bool) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, from matplotlib's files, so that it is there on every system."""
+    """The font DejaVu Sans. Matplotlib's files contain this font, so it need not be installed on the system."""
     import matplotlib
 
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"

@@ -1,4 +1,7 @@
-"""Reads the size of an image from its header alone: a file of a few hundred bytes may claim 10^10 pixels."""
+"""Reads the size of an image from the file's header alone.
+
+A file of a few hundred bytes may declare 10^10 pixels, so the size is checked before any pixel is read.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,11 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-# 16384 x 8192, the size of the largest common environment maps; 2 GiB as RGBA in 32-bit floats.
+# The most pixels that an image may have: 16384 x 8192, as in the largest common environment maps. They take 2 GiB as
+# RGBA in 32-bit floats.
 MOST_PIXELS = 1 << 27
 
-_START = 1 << 16  # bytes; enough for the header of every format
+_START = 1 << 16  # bytes read at the start of a file, enough for every header
 _SIZE = {
     rb"\x89PNG\r\n\x1a\n.{8}(.{4})(.{4})": ">i",
     rb"BM.{16}(.{4})(.{4})": "<i",
@@ -22,7 +26,7 @@ _TGA_END = b"TRUEVISION-XFILE.\0"
 
 
 def header_size(path: str | Path) -> tuple[int, int] | None:
-    """The width and height of an image, without reading its pixels; None for a file in none of Mitsuba's formats."""
+    """The width and height of an image, or None if the file has none of Mitsuba's image formats."""
     with Path(path).open("rb") as file:
         start = file.read(_START)
         for pattern, kind in _SIZE.items():
@@ -38,20 +42,23 @@ def header_size(path: str | Path) -> tuple[int, int] | None:
 def _numbers(kind: str, first: bytes, second: bytes) -> tuple[int, int]:
     if kind in (">i", "<i"):
         return abs(struct.unpack(kind, first)[0]), abs(struct.unpack(kind, second)[0])
-    # 12 digits are enough for any size; Python refuses to convert thousands of digits.
+    # Python refuses to convert thousands of digits, so only the first 12 digits are read. They are enough for any size.
     width, height = int(first[:12]), int(second[:12])
     return (width, height) if kind == "width height" else (height, width)
 
 
 def _exr(start: bytes) -> tuple[int, int] | None:
-    """The size of the largest part of an EXR file."""
+    """The size of the largest part of an EXR file, which may have several parts."""
     windows = [struct.unpack("<4i", w) for w in _DATA_WINDOW.findall(start)]
     sizes = [(right - left + 1, bottom - top + 1) for left, top, right, bottom in windows]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 
 def _jpeg(file: BinaryIO) -> tuple[int, int] | None:
-    """The size in a JPEG file's first frame header, which follows segments of any length."""
+    """The size in a JPEG file's first frame header.
+
+    The segments before this header may have any length, so they are skipped.
+    """
     file.seek(2)
     while len(head := file.read(4)) == 4 and head[0] == 0xFF:
         marker, length = struct.unpack(">xBH", head)
@@ -67,7 +74,7 @@ def _jpeg(file: BinaryIO) -> tuple[int, int] | None:
 
 
 def _tga(file: BinaryIO, start: bytes) -> tuple[int, int] | None:
-    """The size of a TGA file. The format's signature is at the end of the file."""
+    """The size of a TGA image, or None if the format's signature is missing at the end of the file."""
     end = file.seek(0, 2)
     file.seek(max(end - len(_TGA_END), 0))
     if len(start) < 18 or file.read() != _TGA_END:

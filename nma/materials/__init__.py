@@ -1,4 +1,4 @@
-"""Source materials as data: named materials shipped with the package, and files in their format (docs/materials.md)."""
+"""Materials in TOML files (docs/materials.md): named materials that the package contains, and materials of users."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ __all__ = ["Material", "Texture", "load", "names"]
 FOLDER = Path(__file__).parent
 HEADER = ("title", "description", "class", "uv_scale", "parameters")
 TEXTURE_OPTIONS = ("texture", "raw", "channel", "scale", "offset", "uv_scale")
-# A material's file is a page of text; larger files are refused.
+# A material file is about a page of text, so a file with more bytes than this is rejected.
 MAX_BYTES = 1 << 20
 
-_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # .05, which is not a number in TOML
+_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # finds .05, which TOML does not accept as a number
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
 
 @dataclass(frozen=True)
 class Material:
-    """A source material: `values` has a number, an RGB triple or a `Texture` for each parameter of its class.
+    """A material of a class: `values` has a number, an RGB triple or a `Texture` for each parameter of the class.
 
-    Textures that `changed` adds repeat `uv_scale` times per unit of uv, unless they set their own `uv_scale`.
+    A texture that `changed` adds repeats `uv_scale` times per unit of uv, unless the texture has its own `uv_scale`.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Material:
 
     @property
     def textures(self) -> dict[str, Texture]:
-        """The textures of the parameters that images drive, by parameter name."""
+        """The textures among the values, by the name of the parameter."""
         return {name: value for name, value in self.values.items() if isinstance(value, Texture)}
 
     def vector(self) -> NDArray[np.float64]:
@@ -81,10 +81,11 @@ class Material:
         return Material(name, name.replace("-", " ").capitalize(), "", space.name, values)
 
     def changed(self, given: Mapping[str, Any], where: str | Path = "changes") -> Material:
-        """A copy with some parameters replaced. `given` has values as in a file: numbers, lists, colours, `conductor`,
-        textures.
+        """Returns a copy in which the parameters in `given` have new values.
 
-        Texture paths are relative to the folder of `where`; error messages begin with `where`. Raises `MaterialError`.
+        The values have the same form as in a material file: numbers, lists, hexadecimal colours, textures, or a metal
+        for the key `conductor`. `where` is a path: error messages begin with this path, and texture files are relative
+        to its folder. Raises `MaterialError` for a value that is not valid.
         """
         changed = _values(given, self.space, Path(where), self.uv_scale, partial=True)
         return replace(self, values=self.values | changed)
@@ -98,8 +99,9 @@ def names() -> tuple[str, ...]:
 def load(name_or_path: str | Path) -> Material:
     """Loads a shipped material by its name, or a material from a file whose name ends in `.toml`.
 
-    Values must be physically valid; an adapter checks later whether they are in its training range. Texture files must
-    exist, and `Texture.read` reads them. Raises `MaterialError`, which names the file and the fault.
+    The material's values must be physically valid; an adapter checks later whether the values are in the adapter's
+    training range. Texture files must exist; `Texture.read` reads them later. Raises `MaterialError` with the file and
+    the fault.
     """
     if str(name_or_path).endswith(".toml"):
         path = Path(name_or_path)
@@ -116,7 +118,7 @@ def load(name_or_path: str | Path) -> Material:
 
 
 def _document(path: Path) -> Mapping[str, Any]:
-    """The content of a TOML file."""
+    """Reads and parses a TOML file."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise MaterialError(f"{path}: not a material file, because it has more than {MAX_BYTES:,} bytes")
@@ -138,17 +140,21 @@ def _parse(document: Mapping[str, Any], path: Path) -> Material:
     _refuse_unknown(document, HEADER, str(path))
     for key in ("title", "class", "parameters"):
         if key not in document:
-            raise MaterialError(f"{path}: '{key}' is missing; a file has {', '.join(HEADER)}")
+            raise MaterialError(
+                f"{path}: '{key}' is missing; a material file has the keys {', '.join(HEADER)}"
+            )
     for key in ("title", "description", "class"):
         if not isinstance(document.get(key, ""), str):
             raise MaterialError(f"{path}: {key} is {_shown(document[key])}, but must be text in quotes")
     class_name = document["class"]
     if class_name not in sources.classes():
         raise MaterialError(
-            f"{path}: there is no class {_shown(class_name)}; there is {', '.join(sources.classes())}"
+            f"{path}: there is no class {_shown(class_name)}; the classes are {', '.join(sources.classes())}"
         )
     if not isinstance(document["parameters"], Mapping):
-        raise MaterialError(f"{path}: 'parameters' must be a table: [parameters], then one line each")
+        raise MaterialError(
+            f"{path}: 'parameters' must be a table: a line [parameters], then one line per parameter"
+        )
     uv_scale = _uv_scale(document, 1.0, str(path))
     values = _values(document["parameters"], sources.space(class_name), path, uv_scale)
     title, description = (" ".join(document.get(key, "").split()) for key in ("title", "description"))
@@ -158,16 +164,16 @@ def _parse(document: Mapping[str, Any], path: Path) -> Material:
 def _values(
     given: Mapping[str, Any], space: ParamSpace, path: Path, uv_scale: float, partial: bool = False
 ) -> dict[str, Any]:
-    """The checked value of each parameter, in the order of the class. With `partial`, parameters may be missing."""
+    """Returns the checked values, in the order of the class's parameters. With `partial`, parameters may be missing."""
     given = _with_indices(given, path)
     known = [param.name for param in space.params]
     _refuse_unknown(given, (*known, "conductor"), f"{path}, [parameters]")
     if not partial and (missing := [name for name in known if name not in given]):
-        raise MaterialError(f"{path}, [parameters]: {', '.join(missing)} missing")
+        raise MaterialError(f"{path}, [parameters]: no value for {', '.join(missing)}")
     values = {p.name: _value(given[p.name], p, path, uv_scale) for p in space.params if p.name in given}
 
-    # Textures are checked when they are read. Here, an allowed number stands in for textures and for missing
-    # parameters.
+    # Only numbers are checked here, because textures are checked when they are read. For the check, a valid number
+    # takes the place of each texture and of each missing parameter.
     numbers: dict[str, Any] = {param.name: param.low for param in space.params}
     numbers |= {name: value for name, value in values.items() if not isinstance(value, Texture)}
     try:
@@ -178,7 +184,7 @@ def _values(
 
 
 def _with_indices(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """The values, with `conductor` replaced by the refractive index of that metal."""
+    """Returns the values, with the key `conductor` (a metal's name) replaced by the metal's refractive index."""
     values = dict(given)
     if "conductor" not in values:
         return values
@@ -188,7 +194,7 @@ def _with_indices(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
     if name not in metals.names:
         raise MaterialError(
             f"{path}: there is no conductor {_shown(name)}{_suggestion(name, metals.names)}; "
-            f"there is {', '.join(metals.names)}"
+            f"the conductors are {', '.join(metals.names)}"
         )
     row = metals.names.index(name)
     return values | {"eta_conductor": metals.eta[row].tolist(), "k_conductor": metals.k[row].tolist()}
@@ -216,14 +222,16 @@ def _value(given: Any, param: Param, path: Path, uv_scale: float) -> float | tup
 def _colour(given: str, param: Param, path: Path) -> tuple[float, ...]:
     """The linear value of an sRGB colour in hexadecimal digits."""
     if not _is_colour(param):
-        raise MaterialError(f"{path}: {param.name} is {_shown(given)}, but it is not a colour; give numbers")
+        raise MaterialError(
+            f"{path}: {param.name} is {_shown(given)}, but this parameter is no colour; give numbers"
+        )
     if not re.fullmatch("#[0-9a-fA-F]{6}", given):
         raise MaterialError(f"{path}: {param.name} is {_shown(given)}; a colour has six digits, as '#3366ee'")
     return tuple(linear([int(given[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]).tolist())
 
 
 def _is_colour(param: Param) -> bool:
-    """Whether the parameter is a reflectance or albedo per channel, which people pick and paint in sRGB."""
+    """Whether the parameter is a colour, which users choose in sRGB: three numbers in 0..1, such as an albedo."""
     return param.size == 3 and param.bounds("valid") == (0.0, 1.0)
 
 
@@ -231,7 +239,9 @@ def _texture(given: Mapping[str, Any], param: Param, path: Path, uv_scale: float
     where = f"{path}, {param.name}"
     _refuse_unknown(given, TEXTURE_OPTIONS, where)
     if not isinstance(given.get("texture"), str):
-        raise MaterialError(f"{where}: texture must be a file name, relative to the material's file")
+        raise MaterialError(
+            f"{where}: texture must be the name of a file, relative to the material file's folder"
+        )
     if not isinstance(given.get("raw", True), bool):
         raise MaterialError(f"{where}: raw must be true or false")
     scale, offset = (
@@ -240,13 +250,13 @@ def _texture(given: Mapping[str, Any], param: Param, path: Path, uv_scale: float
     image = path.parent / given["texture"]
     if not os.path.isfile(image):
         raise MaterialError(f"{where}: there is no texture {_short(image)}")
-    # By default, images of colours are sRGB and all other images are raw numbers.
+    # By default, an image for a colour is read as sRGB, and any other image as raw numbers.
     raw, channel = given.get("raw", not _is_colour(param)), _channel(given, param, where)
     return Texture(param, image.resolve(), raw, scale, offset, channel, _uv_scale(given, uv_scale, where))
 
 
 def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
-    """The channel chosen for a parameter of one number; None if none is chosen."""
+    """The image channel chosen for a parameter of one number, or None if no channel is chosen."""
     channel = given.get("channel")
     if channel is None:
         return None
@@ -255,12 +265,14 @@ def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
             f"{where}: channel is {_shown(channel)}, but must be {either(map(repr, CHANNELS))}"
         )
     if param.size > 1:
-        raise MaterialError(f"{where}: a channel is for parameters of one number, this one has {param.size}")
+        raise MaterialError(
+            f"{where}: a channel is for parameters of one number, but {param.name} has {param.size}"
+        )
     return channel
 
 
 def _uv_scale(given: Mapping[str, Any], default: float, where: str) -> float:
-    """How often images repeat per unit of uv."""
+    """The number of times that an image repeats per unit of uv."""
     uv_scale = _option(given, "uv_scale", default, where)
     if not uv_scale > 0:
         raise MaterialError(f"{where}: uv_scale is {uv_scale:g}, but must be above 0")
@@ -268,7 +280,7 @@ def _uv_scale(given: Mapping[str, Any], default: float, where: str) -> float:
 
 
 def _option(given: Mapping[str, Any], key: str, default: float, where: str) -> float:
-    """The finite number given for an option, or its default."""
+    """The number given for the option `key`, which must be finite. If no number is given, the option's default."""
     value = given.get(key, default)
     if not (_is_number(value) and abs(_float(value)) < 1e38):
         raise MaterialError(f"{where}: {key} is {_shown(value)}, but must be a finite number")
@@ -280,7 +292,10 @@ def _is_number(x: Any) -> bool:
 
 
 def _float(x: float) -> float:
-    """The number as a float. TOML's integers may be too large for a float; they become infinite."""
+    """Converts a number to a float.
+
+    TOML allows integers that are too large for a float; such integers become infinite.
+    """
     try:
         return float(x)
     except OverflowError:
@@ -288,7 +303,7 @@ def _float(x: float) -> float:
 
 
 def _shown(given: Any) -> str:
-    """A value of a file as text for an error message: short, on one line."""
+    """Converts a value from a file to text for an error message: short, and on one line."""
     try:
         return _REPR.repr(given)
     except ValueError:
@@ -296,7 +311,7 @@ def _shown(given: Any) -> str:
 
 
 def _short(name: object) -> str:
-    """A name as text for an error message: short, on one line."""
+    """Converts a name to text for an error message: short, and on one line."""
     text = repr(str(name))[1:-1]
     return text if len(text) <= 300 else f"{text[:100]}..."
 

@@ -1,4 +1,4 @@
-"""Reads images that drive parameters of materials."""
+"""Reads textures: images that give the parameters of materials their values."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from nma.errors import TextureError, either, one_line
 from nma.images.io import CHANNELS, ImageError, coloured_layer, load_bitmap
 from nma.params import Param
 
-# The channels of a grey pixel may differ by this much, through rounding; for pixels above 1, relative to the pixel.
+# Rounding may make the channels of a grey pixel differ by this much. For pixel values above 1 the limit is relative to
+# the value.
 _GREY = 1e-6
 
 
 @dataclass(frozen=True)
 class Texture:
-    """An image that drives `parameter`: its value is offset + scale * pixel.
+    """An image that gives `parameter` its value at each pixel: offset + scale * pixel.
 
-    Pixels of a `raw` image are the numbers in the file, with bytes scaled to 0..1. Otherwise 8-bit images are sRGB and
-    are made linear. A parameter of one number needs a grey image, or a `channel` out of `CHANNELS`. The image repeats
-    `uv_scale` times per unit of uv.
+    The pixels of a `raw` image are the numbers in the file, with bytes scaled to 0..1. If an image is not `raw` and has
+    8 bits per channel, it is converted from sRGB to linear values. A parameter of one number needs a grey image, or a
+    `channel` of the image (one of `CHANNELS`). The image repeats `uv_scale` times per unit of uv.
     """
 
     parameter: Param
@@ -36,12 +37,12 @@ class Texture:
     uv_scale: float = 1.0
 
     def read(self) -> NDArray[np.float32]:
-        """The parameter's values (height, width, size); row 0 is the top of the image.
+        """Reads the parameter's values (height, width, 1 or 3); row 0 is the top of the image.
 
-        Raises `TextureError` if the file cannot be read, if it is coloured but the parameter is one number and no
-        channel is chosen, or if values are not finite or not valid.
+        Raises `TextureError` if the file cannot be read, or if a value is not finite or not valid. A coloured image for
+        a parameter of one number, without a chosen channel, is an error, too.
         """
-        with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite raise an error below
             values = self._pixels() * np.float32(self.scale) + np.float32(self.offset)
         allowed = self.parameter.bounds("valid")
         bad = allowed.bad(values)
@@ -51,7 +52,10 @@ class Texture:
         return allowed.moved(values)
 
     def _pixels(self) -> NDArray[np.float32]:
-        """The image (height, width, size): linear unless `raw`, and one channel if `size` is 1."""
+        """The image's pixels (height, width, channels), linear unless `raw`.
+
+        A parameter of one number has one channel.
+        """
 
         bitmap = _bitmap(self.path)
         if self.channel == "a" and "A" not in [field.name for field in bitmap.struct_()]:
@@ -65,14 +69,18 @@ class Texture:
             return pixels
         if self.channel is None and _is_coloured(pixels):
             raise TextureError(
-                f"texture {self.path} is coloured, {self.parameter.name} is one number: "
-                f"choose a channel, {{ texture = '{self.path.name}', channel = 'g' }} ({either(map(repr, CHANNELS))})"
+                f"texture {self.path} is coloured, but {self.parameter.name} is one number; "
+                f"choose the channel {either(map(repr, CHANNELS))}, for example "
+                f"{{ texture = '{self.path.name}', channel = 'g' }}"
             )
         first = CHANNELS.index(self.channel or "r")
         return pixels[..., first : first + 1]
 
     def _format(self, own: Any) -> Any:
-        """The pixel format to convert to. It has only the channels that are needed, because images may be large."""
+        """The pixel format to convert the image to.
+
+        Images may be large, so the format has only the channels that are needed.
+        """
         import mitsuba as mi
 
         formats: Any = mi.Bitmap.PixelFormat
@@ -82,7 +90,7 @@ class Texture:
 
 
 def first_pixel(pixels: NDArray, bad: NDArray[np.bool_]) -> tuple[NDArray, str]:
-    """The first bad pixel (channels,) of an image (height, width, channels), and text that says where it is."""
+    """The first bad pixel (channels,) of an image (height, width, channels), and a text with the pixel's position."""
     row, column, _ = np.argwhere(bad)[0]
     if bad.shape[:2] == (1, 1):
         return pixels[0, 0], ""
@@ -100,7 +108,7 @@ def _converted(bitmap: Any, pixel_format: Any) -> NDArray[np.float32]:
 
 
 def _bitmap(path: Path) -> Any:
-    """The image; if it has several layers, the first layer in colour."""
+    """Reads a texture file as a Mitsuba bitmap. If the file has several layers, the first colour layer is taken."""
     import mitsuba as mi
 
     if not os.path.isfile(path):
@@ -115,12 +123,12 @@ def _bitmap(path: Path) -> Any:
         raise TextureError(str(error)) from error
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         names = ", ".join(field.name for field in bitmap.struct_())
-        raise TextureError(f"texture {path} has the channels {names}; it needs R, G, B (and A), or Y")
+        raise TextureError(f"texture {path} has the channels {names}; a texture needs R, G, B (and A), or Y")
     return bitmap
 
 
 def _is_coloured(rgb: NDArray[np.float32]) -> bool:
-    """Whether the channels of any pixel differ by more than rounding."""
+    """Whether the channels of any pixel differ by more than the rounding error."""
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)
     return bool((spread > _GREY * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())
