@@ -1,4 +1,5 @@
-// Prints the directional albedo of a material. It samples the material, as a renderer does at every shading point.
+// Prints the directional albedo of a material. This program samples the BRDF, as a renderer does at every shading
+// point.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example.cpp -o example
 //     ./example nma/adapter/trained/layered3-5x64.safetensors
@@ -7,7 +8,8 @@
 #include <cstdio>
 #include <random>
 
-// Gold of microfacet width .1 under a red coat of width .02 and index 1.5. CONVENTIONS.md lists the parameters.
+// The parameters of gold with roughness .1 under a red coat of roughness .02 and index of refraction 1.5.
+// CONVENTIONS.md lists the parameters of the class `layered3`.
 constexpr float RED_GOLD[nma::layered3::COLUMNS] = {.02f,  .1f,  1.5f, .14f, .37f, 1.44f, 3.98f,
                                                     2.38f, 1.6f, .9f,  .3f,  .2f,  .5f};
 

@@ -1,17 +1,17 @@
-// Estimates the light of a small lamp that the simulated material reflects, in four ways that agree on average. Two of
-// them use its density `pdf`.
+// Estimates the light of a small lamp that the simulated material reflects towards the viewer. The four estimates have
+// the same mean. The last two use the density `pdf` of the material.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered
 //
-// - Walks alone: a walk leaves in a direction of the material's choice, which seldom meets a small lamp.
-// - Evaluation alone: `evaluate` takes directions to the lamp, and most of them miss the peak of a narrow lobe.
-// - Both: a path tracer does both, and weighs each sample by the densities of both ways (Veach 1997, eq. 9.8). The
-//   density of a walk has no closed form. Any density will do, as long as both ways use the same. `pdf` is close to the
-//   density of a walk, so its weights are good.
-// - `sample`: blends and masks of materials recombine samples by their densities. Such samples must follow their
-// density
-//   exactly. Those of `sample` follow `pdf`.
+// - Walks alone: the direction in which a walk leaves is drawn by the material, so the walk seldom meets a small lamp.
+// - Evaluation alone: the directions to the lamp are drawn uniformly, so most of them miss the peak of a narrow lobe.
+// - Walks and evaluation: a path tracer combines both, and weights each sample by multiple importance sampling (Veach
+//   1997, eq. 9.8). The weights need the densities of both estimates, but the density of a walk has no closed form. The
+//   mean stays the same with any other density, if both estimates use it. `pdf` is close to the density of a walk, so
+//   it makes the noise small.
+// - `sample`: blends and masks of materials compute weights from the densities of samples, so the samples must have
+//   exactly that density. Directions that `sample` draws have exactly the density `pdf`.
 #include <cstdio>
 
 #include "nma/layered.h"
@@ -19,10 +19,11 @@
 namespace layered = nma::layered;
 using layered::Vec;
 
-// Gold under a red coat: the parameters of the class in CONVENTIONS.md.
+// The parameters of gold under a red coat. CONVENTIONS.md lists the parameters of the class `layered3`.
 constexpr float GOLD[nma::layered3::COLUMNS] = {.01f,  .1f,  1.5f, .14f, .37f, 1.44f, 3.98f,
                                                 2.38f, 1.6f, .9f,  .3f,  .2f,  .5f};
-// A round lamp of radiance 1. It fills all directions whose cosine to the centre of the lamp is larger than LAMP_COS.
+// A round lamp of radiance 1. The lamp covers all directions w with dot(w, LAMP) > LAMP_COS, where LAMP points to its
+// centre.
 constexpr float LAMP_COS = .95f;
 constexpr float LAMP_PDF = nma::INV_PI<float> / (2.0f * (1.0f - LAMP_COS));
 const Vec VIEW{.6f, 0.0f, .8f}, LAMP{-.8f, 0.0f, .6f};
@@ -44,7 +45,7 @@ struct Estimate {
 
 bool lit(const Vec& wo) { return nma::dot(wo, LAMP) > LAMP_COS; }
 
-// A direction to the lamp, drawn uniformly from all of them.
+// A direction to the lamp, drawn uniformly over the solid angle of the lamp.
 Vec towards_lamp(float u1, float u2) {
     const float z = 1.0f - u1 * (1.0f - LAMP_COS), r = nma::safe_sqrt(1.0f - z * z), phi = 2.0f * nma::PI<float> * u2;
     const Vec across{LAMP.z, 0.0f, -LAMP.x};
@@ -65,7 +66,8 @@ int main() {
         const Vec wo = towards_lamp(random.uniform(), random.uniform());
         const Vec seen = layered::evaluate(gold, VIEW, wo, random) * (1.0f / LAMP_PDF);
 
-        // The weight of a walk among the two ways to draw the direction w within the lamp.
+        // The weight of a walk that leaves in the direction w towards the lamp. The evaluation has the remaining
+        // weight.
         const auto odds = [&](const Vec& w) {
             return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF);
         };

@@ -1,4 +1,5 @@
-// Neural Material Adapter: expensive materials rendered as blends of Principled BRDFs that a tiny network prepares.
+// Neural Material Adapter: renders expensive materials as blends of Principled BRDFs, whose parameters a tiny network
+// computes.
 //
 //     const nma::Adapter adapter = nma::Adapter::load("layered3-5x64.safetensors");
 //     adapter.clamp(parameters);                                         // or refuse them: adapter.check(parameters)
@@ -6,12 +7,12 @@
 //     const nma::Value v = brdf.eval_pdf(wi, wo);                        // f cos(theta_o) [1/sr] and pdf [1/sr]
 //     const nma::Sampled s = brdf.sample(wi, u_lobe, u1, u2);
 //
-// C++17, no dependencies. The network runs on the widest vectors of the CPU (`InstructionSet`). Two functions allocate
-// memory and may throw `nma::Error`: loading an adapter, and making `Curves`. All others do neither, and many threads
-// may call them at once. Directions are unit vectors in the local frame, z up: `wi` points towards the viewer, `wo`
-// towards the light.
+// The headers are C++17 and have no dependencies. The network uses the widest vector instructions of the CPU
+// (`InstructionSet`). Loading an adapter and making `Curves` allocate memory and may throw `nma::Error`. No other
+// function allocates memory or throws, and many threads may call the other functions at once. Directions are unit
+// vectors in the local frame, with z up. `wi` points towards the viewer, and `wo` towards the light.
 //
-// Where things are, in the order in which a query meets them:
+// The headers, in the order in which a query uses them:
 //
 //     nma.h              Adapter, Curves, and the functions ..._many
 //     nma/weights.h      Weights: the weights file, read and checked; nma/json.h reads its JSON
@@ -37,20 +38,20 @@
 
 namespace nma {
 
-// How a weights file is loaded.
+// The options for loading a weights file.
 struct Options {
-    // If this CPU lacks the instruction set, `portable` runs instead. All instruction sets compute in float32, except
-    // avx512_bf16: it rounds weights and activations to bfloat16, which keeps 8 significant bits. This halves the time
-    // of a network on some CPUs.
+    // If the CPU lacks the instruction set, `portable` is used instead. All instruction sets compute in float32, except
+    // avx512_bf16. The latter rounds weights and activations to bfloat16, which keeps 8 significant bits, and so halves
+    // the time of a network on some CPUs.
     InstructionSet set = fastest();
-    // Rounds weights to bfloat16, which halves the memory that a query has to fetch. It raised the log loss of both
-    // shipped adapters by less than .00002. The instruction set avx512_bf16 always rounds weights.
+    // Rounds weights to bfloat16, which halves the memory that a query has to read. The rounding raised the log loss of
+    // both shipped adapters by less than .00002. The instruction set avx512_bf16 always rounds weights.
     bool compact = false;
 };
 
 class Adapter {
 public:
-    // The count of queries that `prepare_many` works on at once.
+    // `prepare_many` splits the queries into blocks of this count.
     static constexpr int BLOCK = 24;
 
     static Adapter load(const std::string& path, const Options& options = {}) {
@@ -66,39 +67,40 @@ public:
         return Adapter(parse_weights(bytes, size), options);
     }
 
-    // The count of numbers that `prepare` reads, in the order of `parameters`. A colour has three.
+    // The count of numbers that `prepare` reads as the parameters of a material. They are in the order of
+    // `parameters()`. A colour has three numbers.
     int parameter_count() const { return preparation_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
-    // The numbers of the material that the adapter was fitted to, if it was fitted to one. `prepare` then reads no
-    // parameters. Empty if the adapter was trained on a class.
+    // The parameters of the single material that the adapter was fitted to, for which `prepare` reads no parameters.
+    // The vector is empty if the adapter was trained on a class.
     const std::vector<float>& material() const { return weights_.material; }
-    // The index of the first number that is not allowed, or -1. A number is allowed if it is finite and lies in its
-    // training range; beyond that range the network makes up plausible values. If the adapter was fitted to a single
-    // material, only the numbers of that material are allowed. `parameter` finds the parameter that a number belongs
-    // to.
+    // The index of the first number that is not allowed, or -1 if all numbers are allowed. A number is allowed if it is
+    // finite and lies in its training range. Outside that range, the BRDF looks plausible, but does not match the
+    // source material. If the adapter was fitted to a single material, only the parameters of that material are
+    // allowed. `parameter(index)` returns the parameter that the number with this index belongs to.
     int check(const float* parameters) const {
         for (int k = 0; k < parameter_count(); ++k)
             if (!allowed(k, parameters[k])) return k;
         return -1;
     }
-    // Moves each number into its training range, and NaN to the lower end. Does nothing if the adapter was fitted to a
-    // single material.
+    // Moves each number into its training range, and NaN to the lower end of the range. Does nothing if the adapter was
+    // fitted to a single material.
     void clamp(float* parameters) const {
         if (!material().empty()) return;
         for (int k = 0; k < parameter_count(); ++k) parameters[k] = parameter(k).clamped(parameters[k]);
     }
-    // The parameter that the number of this index belongs to.
+    // The parameter that the number with this index belongs to.
     const SourceParam& parameter(int index) const { return weights_.parameters[owners_[index]]; }
 
-    // The count of numbers that the network returns for a query. They describe a blend.
+    // The count of numbers that the network returns for a query. These numbers describe a blend.
     int output_count() const { return preparation_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
-    // Whether the azimuth of `wi` matters. If not, `prepare` reads wi.z alone. Functions that take a cosine c instead
-    // of `wi` use the azimuth 0, which is wi = (sqrt(1 - c^2), 0, c).
+    // Whether the BRDF depends on the azimuth of `wi`. If it does not, `prepare` reads only wi.z. Functions that take a
+    // cosine c instead of `wi` use the azimuth 0, which is wi = (sqrt(1 - c^2), 0, c).
     bool anisotropic() const { return preparation_.encoding.anisotropic(); }
 
-    // The BRDF for the parameters of a source material, seen from `wi`, which has z in (0, 1].
+    // The BRDF of a source material with these parameters for the view direction `wi`, which has z in (0, 1].
     Brdf prepare(const float* parameters, const Direction& wi) const {
         Brdf made;
         made.in_plane_ = in_plane_;
@@ -109,8 +111,8 @@ public:
         return prepare(parameters, at_azimuth_0(cos_theta_i));
     }
 
-    // Prepares many shading points, and loads the weights once for several of them. `parameters` has a row for each
-    // shading point, `parameter_count` numbers long.
+    // Prepares the BRDFs of many shading points, and reads the weights from memory once for several shading points.
+    // `parameters` has a row of `parameter_count` numbers for each shading point.
     void prepare_many(int count, const float* parameters, const Direction* wi, Brdf* brdfs) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
@@ -142,7 +144,8 @@ public:
         network_outputs(parameters, at_azimuth_0(cos_theta_i), raw);
     }
 
-    // The outputs of the network for many queries: rows of `output_count` numbers, without alignment.
+    // The outputs of the network for many queries. `raw` gets a row of `output_count` numbers for each query, without
+    // alignment.
     void network_outputs_many(int count, const float* parameters, const Direction* wi, float* raw) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
@@ -163,9 +166,9 @@ public:
 private:
     friend class Curves;
 
-    // The order matters: each step reads what the steps before it wrote.
+    // The order of the steps matters, because each step reads results of the steps before it.
     Adapter(Weights weights, const Options& options) : weights_(std::move(weights)) {
-        // The counts of inputs and outputs that the description asks for.
+        // Computes the counts of inputs and outputs from the description in the file.
         for (const TargetParam& p : weights_.target) add_places(p);
         for (std::size_t k = 0; k < weights_.parameters.size(); ++k)
             owners_.insert(owners_.end(), weights_.parameters[k].size, k);
@@ -173,14 +176,14 @@ private:
         preparation_.instances = weights_.instances;
         preparation_.outputs = static_cast<int>(places_.size()) * weights_.instances + weights_.instances - 1;
         preparation_.bounded = weights_.bounded;
-        // `check_description` compares these counts with the layers, so it needs the layers as the file has them.
+        // `check_description` compares these counts with the sizes of the layers, so it needs the layers as they are in
+        // the file.
         check_description();
-        // From here on the first layer differs from the file: its inputs are in the order in which `encode` writes
-        // them.
+        // Reorders the inputs of the first layer to the order in which `encode` writes them.
         weights_.layers.front() = preparation_.encoding.arranged(weights_.layers.front());
         network_ = Network(weights_.layers, options.set, options.compact);
         preparation_.network = network_.view();
-        // Both use the padded output width, which the network has chosen.
+        // These two functions need the padded count of outputs, which `Network` has computed.
         lay_out_ranges();
         lay_out_lanes();
         // The network has copied the weights.
@@ -189,38 +192,40 @@ private:
 
     const Kernels& kernels() const { return network_.kernels_in_use(); }
 
-    // Whether x is allowed as number `k` of the parameters: see `check`.
+    // Whether x is allowed as the number with index `k`: see `check`.
     bool allowed(int k, float x) const {
         if (material().empty()) return parameter(k).allows(x);
         return same(x, material()[k]);
     }
 
-    // Appends the places of a target parameter's numbers. A place is an index in `Principled`, seen as an array of
-    // numbers.
+    // Appends the places of a target parameter's numbers to `places_`. A place is an index in an array of all numbers
+    // of `Principled`.
     void add_places(const TargetParam& p) {
         in_plane_ |= p.in_plane;
         const int first = static_cast<int>(detail::field(p.name, p.size).first);
         for (int c = 0; c < p.size; ++c) places_.push_back(first + c);
     }
 
-    // Throws if the network does not fit its description, or if this version cannot evaluate its target.
+    // Throws if the network contradicts the description in the file, or if this version of the runtime cannot evaluate
+    // the target.
     void check_description() const {
         if (anisotropic() && (in_plane_ || !weights_.directional))
             throw Error(
                 "it is anisotropic, but its lobes stretch along the plane of incidence, or its network does not read "
                 "the view direction; train again");
         if (weights_.dialect != DIALECT)
-            throw Error("it was written for the Principled dialect '" + weights_.dialect +
-                        "', this version evaluates '" + DIALECT + "'");
+            throw Error("the network was trained for the Principled dialect '" + weights_.dialect +
+                        "', but this version evaluates '" + DIALECT + "'");
         if (weights_.instances > MAX_INSTANCES)
-            throw Error("it blends more than " + std::to_string(MAX_INSTANCES) +
-                        " instances, which this version cannot");
+            throw Error("the network blends more than " + std::to_string(MAX_INSTANCES) +
+                        " instances, which this version cannot evaluate");
         if (weights_.layers.front().in != preparation_.encoding.size() || weights_.layers.back().out != output_count())
             throw Error("the network does not fit its description; train again");
     }
 
-    // Fills in the ranges of all outputs. The outputs are the parameters of the first instance, of the second, and so
-    // on, and then the shares of the blend, which lie in 0 .. 1. The padding keeps its zeros.
+    // Fills in the ranges of all outputs. The outputs are the target parameters of the first instance, of the second
+    // instance, and so on, and then the shares from which `assemble` computes the weights of the blend. Shares lie in 0
+    // .. 1. The ranges of the padding stay 0.
     void lay_out_ranges() {
         const int count = network_.output_stride();
         ranges_ = detail::aligned<float>(5 * static_cast<std::size_t>(count));
@@ -241,8 +246,8 @@ private:
     }
 
     // Fills in `Preparation::outputs_of_lanes`. Fields that the network does not set, and lanes without an instance,
-    // get the index of the first output of padding. It exists because `Network` pads the last layer by at least one
-    // neuron, and its decoded value is 0 because its weights and its range are 0.
+    // get the index of the first output of padding. `Network` pads the last layer by at least one neuron, so this
+    // output exists. The weights and the range of this output are 0, so its decoded value is 0.
     void lay_out_lanes() {
         const int size = static_cast<int>(places_.size()), per_pack = Blend<float>::PRINCIPLED_SIZE * LANES;
         const int zero = output_count();
@@ -253,7 +258,8 @@ private:
         preparation_.outputs_of_lanes = outputs_of_lanes_.data();
     }
 
-    // A direction with this cosine. Isotropic adapters read only z, so x is not worth a square root for them.
+    // A direction with this cosine and the azimuth 0. For isotropic adapters, which read only z, x is 0, which saves a
+    // square root.
     Direction at_azimuth_0(float cos_theta_i) const {
         return {anisotropic() ? safe_sqrt(1.0f - cos_theta_i * cos_theta_i) : 0.0f, 0.0f, cos_theta_i};
     }
@@ -270,7 +276,7 @@ private:
         }
     }
 
-    // The parameters of the query with index `q`.
+    // The row of `parameters` that belongs to the query with index `q`.
     const float* row(const float* parameters, int q) const {
         return parameters + static_cast<std::size_t>(q) * parameter_count();
     }
@@ -293,15 +299,15 @@ private:
     bool in_plane_ = false;
 };
 
-// The blends of an untextured material at many values of cos(theta_i), and the interpolation between them. The network
-// does not run at the shading point. Isotropic adapters only.
+// The blends of an untextured material at many values of cos(theta_i), and the interpolation between these blends. With
+// `Curves`, no network runs at the shading point. Only isotropic adapters have curves.
 class Curves {
 public:
-    // The same constants as in nma/render/curves.py. The first node has the cosine MIN_COS instead of 0.
+    // nma/render/curves.py has the same constants. The first node has the cosine MIN_COS instead of 0.
     static constexpr int NODES = 128;
     static constexpr float MIN_COS = 1e-4f;
 
-    // Throws `Error` for anisotropic adapters.
+    // Throws `Error` if the adapter is anisotropic.
     Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
         if (adapter.anisotropic())
             throw Error(
@@ -312,8 +318,8 @@ public:
         }
     }
 
-    // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of both nodes sum to 1, so the
-    // interpolated weights do. The same holds for the lobe probabilities.
+    // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of each node sum to 1, so the
+    // interpolated weights sum to 1, too. The same is true for the lobe probabilities.
     Brdf at(float cos_theta_i) const {
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
@@ -338,7 +344,8 @@ private:
     std::vector<Brdf> nodes_;
 };
 
-// Calls `Brdf::eval_pdf` or `Brdf::sample` for many shading points. `u` has three uniform numbers for each.
+// Call `Brdf::eval_pdf` or `Brdf::sample` for many shading points. `u` has three uniform numbers for each shading
+// point.
 inline void eval_pdf_many(int count, const Brdf* brdfs, const Direction* wi, const Direction* wo, Value* values) {
     for (int k = 0; k < count; ++k) values[k] = brdfs[k].eval_pdf(wi[k], wo[k]);
 }

@@ -31,7 +31,7 @@ void in_blocks(int count, F work) {
     for (int first = 0; first < count; first += BLOCK) work(static_cast<size_t>(first), std::min(BLOCK, count - first));
 }
 
-// Prepares at most BLOCK queries. `views` are cosines or directions.
+// Prepares at most BLOCK queries. `views` are cosines or view directions.
 template <class View>
 void prepare_block(const nma::Adapter& adapter, int count, const float* parameters, const View* views,
                    nma_brdf* brdfs) {

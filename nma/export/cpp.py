@@ -27,8 +27,8 @@ _HEAD = """\
 namespace nma {
 """
 _FIELDS = """\
-// A field of `Principled`. It has `size` numbers, with values in low .. high. `first` is the index of its first number
-// in an array of all numbers of `Principled`.
+// A field of `Principled`. The field has `size` numbers, with values in low .. high. `first` is the index of the first
+// of these numbers in an array of all numbers of `Principled`.
 struct Field {
     const char* name;
     std::size_t first;

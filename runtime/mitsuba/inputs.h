@@ -1,4 +1,5 @@
-// The inputs of a Mitsuba BSDF for a source material. Each parameter is an input: a number, a colour or a texture.
+// The inputs of a Mitsuba BSDF for a source material. Each parameter of the material is an input: a number, a colour or
+// a texture.
 #pragma once
 
 #include <mitsuba/core/logger.h>
@@ -24,22 +25,23 @@ struct Input {
 
     SourceParam param;
     ref<Texture> texture;
-    // `shown` holds the numbers that `mi.traverse` shows. `value` holds the numbers that were last checked, moved into
-    // the range. If the object of a texture is shared, another owner may edit it without a call to this input. `value`
-    // is then out of date.
+    // `shown` holds the numbers that `mi.traverse` returns. `value` holds the numbers that were last checked, moved
+    // into the range of the parameter. If a texture object is shared, another owner may edit the texture without a call
+    // to this input, and then `value` is out of date.
     Colour value, shown;
-    // For a parameter of one number: the index of the texture's channel that it takes. -1 if none was chosen.
+    // If the parameter has one number, this is the index of the texture channel that it reads, or -1 if no channel was
+    // chosen.
     int channel = -1;
-    // Whether all numbers of the texture are known before anything is rendered.
+    // Whether all numbers of the texture are known before rendering.
     bool known = false;
 
-    // Whether the input may differ between points. A texture whose numbers are not known, such as a mesh attribute,
-    // may differ even where Mitsuba says that it does not.
+    // Whether the input may differ between points of the surface. A texture whose numbers are not known before
+    // rendering, such as a mesh attribute, may differ even if Mitsuba's `is_spatially_varying` returns false.
     bool varies() const { return texture && (!known || texture->is_spatially_varying()); }
-    // Whether the input is the same at all points, but is an object that may have other owners.
+    // Whether the input is a texture that is the same at all points. The texture object may have other owners.
     bool shared() const { return texture && !varies(); }
 
-    // The numbers of the texture at `si`, without a check.
+    // The numbers of the texture at `si`. They are not checked.
     Colour looked_up(const SurfaceInteraction3f& si) const {
         const Colour colour = Colour(texture->eval(si));
         return param.size == 1 ? Colour(colour[std::max(channel, 0)]) : colour;
@@ -53,9 +55,10 @@ public:
     using Input = nma_plugin::Input<Float, Spectrum>;
     using Colour = typename Input::Colour;
 
-    // Reads one input for each of `parameters` from the properties, and checks it against the range of the parameter.
-    // `trained` says that these are training ranges. With them, the property `clamp` moves numbers into the range
-    // instead of refusing them. Numbers that a texture gets only while rendering (mesh attributes) are always moved.
+    // Reads one input for each of `parameters` from the properties, and checks the input against the range of the
+    // parameter. `trained` says that the ranges are training ranges. For training ranges, the property `clamp` moves
+    // numbers into the range instead of rejecting them. Numbers that are known only during rendering (mesh attributes)
+    // are always moved into the range.
     Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained)
         : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
         if (props.has_property("material"))
@@ -71,7 +74,7 @@ public:
         }
     }
 
-    // Whether any input may differ between points.
+    // Whether any input may differ between points of the surface.
     bool textured() const {
         return std::any_of(inputs_.begin(), inputs_.end(), [](const Input& input) { return input.varies(); });
     }
@@ -82,7 +85,7 @@ public:
         return textured() ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;
     }
 
-    // Writes the numbers of all parameters at `si`, one after the other. After an edit that was refused, this throws
+    // Writes the numbers of all parameters at `si`, one after the other. After a rejected edit, this function throws
     // until another edit is accepted.
     void at(const SurfaceInteraction3f& si, float* to) const {
         if (!fault_.empty()) Throw("%s", fault_);
@@ -125,7 +128,7 @@ public:
         return found == inputs_.end() ? nullptr : &*found;
     }
 
-    // The one or three numbers of an input at `si`, within the range.
+    // The one or three numbers of an input at `si`, within the range of the parameter.
     Colour at(const Input& input, const SurfaceInteraction3f& si) const {
         if (!input.texture) return input.value;
         const Colour colour = input.looked_up(si);
@@ -177,7 +180,7 @@ private:
         return input;
     }
 
-    // The index of the channel that the property NAME_channel chooses, or -1.
+    // The index of the texture channel that the property NAME_channel chooses, or -1 without this property.
     static int channel(const Properties& props, const Input& input) {
         const std::string name = input.param.name + "_channel";
         if (!props.has_property(name)) return -1;
@@ -189,7 +192,7 @@ private:
         return static_cast<int>(place);
     }
 
-    // Throws if the input is not allowed. Otherwise stores its numbers as `value`.
+    // Throws if a number of the input is not allowed. Otherwise stores the numbers in `input.value`.
     void accept(Input& input) const {
         const SourceParam& p = input.param;
         if (input.texture) {
@@ -204,8 +207,8 @@ private:
         input.value = within(p, input.shown);
     }
 
-    // Throws if a pixel is not allowed, or if pixels are coloured, the parameter has one number, and no channel was
-    // chosen.
+    // Throws if a pixel has a number that is not allowed. Throws also if the pixels are coloured, the parameter has one
+    // number, and no channel was chosen.
     void check(const Input& input, const Texels& texels) const {
         const SourceParam& p = input.param;
         const auto& numbers = texels.numbers;
@@ -242,7 +245,7 @@ private:
         return nma::is_finite(number) && (clamp_ || p.allows(number));
     }
 
-    // The message for a value that is not allowed. `Bounds.refusal` in nma/params.py has the same sentence.
+    // The error message for a value that is not allowed. `Bounds.refusal` in nma/params.py makes the same message.
     std::string refusal(const SourceParam& p, const Colour& found) const {
         const auto text = [](Float x) { return tfm::format("%.7g", x); };
         const std::string x = text(found.x()), y = text(found.y()), z = text(found.z());

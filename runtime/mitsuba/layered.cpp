@@ -1,12 +1,14 @@
-// Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, the reference for its adapter.
-// `nma mitsuba build` compiles it. Its properties are the parameters of the class `layered3`.
+// Mitsuba 3 BSDF `layered` for the variant scalar_rgb: the simulated material itself, which is the reference for its
+// adapter. `nma mitsuba build` compiles this plugin. The properties of the BSDF are the parameters of the class
+// `layered3`.
 //
-// `eval` returns one unbiased estimate of the value. Mitsuba passes it no random numbers, so it makes its own from the
-// bits of its arguments.
+// `eval` returns one unbiased estimate of the value. Mitsuba passes no random numbers to `eval`, so `eval` derives
+// random numbers from the bits of its arguments.
 //
-// `sample` follows one walk if the shape has this very BSDF. Other BSDFs may contain this one, such as `blendbsdf` and
-// `mask`. They recombine samples by their densities, so the directions must follow `pdf` exactly, which a walk's do
-// not. For them, `sample` draws from `pdf`, and the weight is an estimate of the value divided by `pdf`.
+// `sample` simulates one walk if this BSDF is the BSDF of the shape. Other BSDFs, such as `blendbsdf` and `mask`, may
+// contain this BSDF. Those BSDFs compute weights from the densities of samples, so the sampled directions must have the
+// exact density `pdf`. The directions of walks have another density, so inside of other BSDFs `sample` draws directions
+// with the density `pdf` instead. The weight of such a sample is an estimate of the value, divided by `pdf`.
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/shape.h>
 
@@ -57,7 +59,7 @@ public:
     MI_DECLARE_CLASS(LayeredBSDF)
 
 private:
-    // The material at one shading point, and the direction in which it is seen.
+    // The material at one shading point, and the view direction.
     struct View {
         nma::layered::Stack stack;
         nma::layered::Vec wi;
@@ -79,7 +81,7 @@ private:
         return nma::layered::albedo(at(inputs_, si), direction(si.wi));
     }
 
-    // A generator of random numbers that depends on the bits of `numbers`.
+    // A random number generator that is seeded with the bits of `numbers`.
     template <std::size_t N>
     static nma::layered::Random random(const float (&numbers)[N]) {
         std::uint32_t a = N, b = 0x9e3779b9u;
@@ -109,7 +111,8 @@ private:
         return {drawn, weight};
     }
 
-    // The direction in which a walk leaves. Returns the walk's throughput. The density is close to the walk's own.
+    // Simulates a walk, and writes the direction in which it leaves to `drawn`. Returns the walk's throughput.
+    // `drawn.pdf` is close to the unknown density of the walk's direction.
     static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                            BSDFSample3f& drawn) {
         nma::layered::Random rng = random({u, u2.x(), u2.y(), si.wi.x(), si.wi.y(), si.wi.z()});
@@ -120,7 +123,8 @@ private:
         return Spectrum(t.x, t.y, t.z);
     }
 
-    // A direction that follows the density. Returns an estimate of the value, divided by the density.
+    // Draws a direction with the exact density `pdf`, and writes it to `drawn`. Returns an estimate of the value,
+    // divided by the density.
     static Spectrum followed(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                              BSDFSample3f& drawn) {
         const nma::Vec3<float> wo = nma::layered::sample(view.stack, view.density, view.wi, u, u2.x(), u2.y()).wo;

@@ -1,12 +1,12 @@
 // Mitsuba 3 BSDF `nma` for the variant scalar_rgb: a source material, rendered by its adapter. `nma mitsuba build`
-// compiles it.
+// compiles this plugin.
 //
-// It shares some properties with the Python BSDF of the same name: `adapter`, the name of a shipped adapter or a
-// weights file; `clamp`; and the parameters of the adapter's class. This plugin has two more:
-// - `online`: run the network at every shading point. Otherwise an isotropic material without textures becomes curves
-//   over cos(theta_i) when it is loaded.
-// - `precision`: "float32"; "compact", which stores weights as bfloat16 and is faster; or "bfloat16", which also rounds
-//   activations to bfloat16 if the CPU has products of bfloat16.
+// This plugin shares these properties with the Python BSDF of the same name: `adapter` (the name of a shipped adapter,
+// or a weights file), `clamp`, and the parameters of the adapter's class. The plugin has two additional properties:
+// - `online`: run the network at every shading point. If `online` is false, the blends of an isotropic material without
+//   textures are tabulated over cos(theta_i) (`nma::Curves`) when the scene is loaded.
+// - `precision`: "float32", "compact" or "bfloat16". "compact" stores weights as bfloat16, which is faster. "bfloat16"
+//   also rounds activations to bfloat16 if the CPU has instructions for products of bfloat16.
 #include <mitsuba/core/fresolver.h>
 
 #include "nma.h"
@@ -78,8 +78,9 @@ private:
         return std::string(props.get<std::string_view>("adapter", "layered3-5x64"));
     }
 
-    // The parameters that the BSDF reads: those of the adapter's class. It reads none if the adapter was fitted to a
-    // single material. A scene may still give the parameters of that material, but no others.
+    // The parameters that the BSDF reads are those of the adapter's class. If the adapter was fitted to a single
+    // material, the BSDF reads no parameters. A scene may then give the parameters of that material, but no other
+    // values.
     static std::vector<SourceParam> wanted(const Properties& props, const nma::Adapter& adapter) {
         if (adapter.material().empty()) return adapter.parameters();
         const float* known = adapter.material().data();
@@ -90,7 +91,7 @@ private:
         return {};
     }
 
-    // Throws if the property of parameter `p` differs from `known`, the numbers of the single material.
+    // Throws if the property of parameter `p` differs from `known`, which are its numbers in the single material.
     static void refuse_others(const Properties& props, SourceParam p, const float* known) {
         p.low = -1e30, p.high = 1e30;
         const Inputs given(props, {p}, false);
@@ -103,12 +104,11 @@ private:
             if (!nma::same(numbers[c], known[c]))
                 Throw(
                     "the adapter was trained for a single material, whose %s is %g, not %g; fit another adapter to "
-                    "your "
-                    "material, or use an adapter of its class",
+                    "your material, or use an adapter of its class",
                     p.name, known[c], numbers[c]);
     }
 
-    // Makes the curves of the present inputs, if the material can have curves.
+    // Makes the curves for the current inputs if the material is isotropic and has no textures, and `online` is false.
     void tabulate() {
         if (inputs_.textured() || online_ || adapter_.anisotropic()) return;
         float parameters[MOST_PARAMETERS];
@@ -116,8 +116,8 @@ private:
         curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
     }
 
-    // Weights files are searched where Mitsuba searches files: beside the scene, and beside the plugins, where the
-    // shipped weights are.
+    // Loads the weights file `name`. Mitsuba's file resolver searches it beside the scene, and beside the plugins,
+    // where the shipped adapters are.
     static nma::Adapter load(const std::string& name, std::string_view precision) {
         const auto resolver = file_resolver();
         auto path = resolver->resolve(name);
@@ -131,8 +131,8 @@ private:
         try {
             nma::Adapter adapter = nma::Adapter::load(fs::exists(path) ? path.string() : name, options);
             if (adapter.parameter_count() > MOST_PARAMETERS)
-                throw nma::Error(name + ": its class has more than " + std::to_string(MOST_PARAMETERS) +
-                                 " numbers as parameters");
+                throw nma::Error(name + ": the parameters of its class have more than " +
+                                 std::to_string(MOST_PARAMETERS) + " numbers");
             return adapter;
         } catch (const nma::Error& e) {
             Throw("%s", e.what());
@@ -170,9 +170,9 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value that this plugin returns to Mitsuba. On a path from the camera, it is `value`. On a path from the
-    // light, the camera is towards `wo`, so a blend is prepared for `wo`. Both kinds of paths then see the same
-    // reflection: one blend would give another value with its two directions swapped.
+    // The value that this plugin returns to Mitsuba. On a path from the camera, the value is `value`. On a path from
+    // the light, `wo` points towards the camera, so a blend is prepared for `wo`. This makes the reflection the same
+    // for both kinds of paths. A blend is not reciprocal, so the blend prepared for `si.wi` would return another value.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

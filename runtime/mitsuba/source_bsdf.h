@@ -1,5 +1,5 @@
-// The common part of the BSDFs `nma` and `layered`. Mitsuba can show, edit and evaluate their inputs. They reflect on
-// the front side only.
+// The common part of the BSDFs `nma` and `layered`, which reflect on the front side only. Mitsuba can show, edit and
+// evaluate the inputs of these BSDFs.
 #pragma once
 
 #include "inputs.h"
@@ -31,8 +31,8 @@ public:
         return this->eval_pdf(context, si, wo, active).first;
     }
 
-    // The directional albedo of all reflection, not only of the diffuse part: denoisers ask for the colour of a
-    // surface.
+    // Returns the directional albedo of all reflection, not only of the diffuse part, because denoisers call this
+    // function for the colour of a surface.
     Spectrum eval_diffuse_reflectance(const SurfaceInteraction3f& si, Mask) const override {
         if (!(si.wi.z() > 0.0f)) return 0.0f;
         const nma::Vec3<float> found = albedo(si);
@@ -51,7 +51,7 @@ public:
         const Input* input = inputs_.find(name);
         return input ? UnpolarizedSpectrum(inputs_.at(*input, si)) : Base::eval_attribute(name, si, active);
     }
-    // For a colour, the mean of its channels, as Mitsuba's own textures return it.
+    // For a colour, returns the mean of its channels, as Mitsuba's own textures do.
     Float eval_attribute_1(const std::string& name, const SurfaceInteraction3f& si, Mask active) const override {
         const Input* input = inputs_.find(name);
         return input ? dr::mean(inputs_.at(*input, si)) : Base::eval_attribute_1(name, si, active);
@@ -62,10 +62,11 @@ public:
     }
 
 protected:
-    // The directional albedo at si.wi, whose z is positive.
+    // The directional albedo for the view direction si.wi, whose z is positive.
     virtual nma::Vec3<float> albedo(const SurfaceInteraction3f& si) const = 0;
 
-    // Whether nothing is reflected: the surface is seen from behind, or the context leaves out glossy reflection.
+    // Whether the BSDF reflects nothing, because the surface is seen from behind or the context excludes glossy
+    // reflection.
     static bool hidden(const BSDFContext& context, const SurfaceInteraction3f& si) {
         return !(si.wi.z() > 0.0f) || !context.is_enabled(BSDFFlags::GlossyReflection, 0);
     }

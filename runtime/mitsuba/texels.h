@@ -1,4 +1,4 @@
-// The numbers of a texture, as far as they are known before anything is rendered.
+// Finds the numbers of a texture that are known before rendering.
 #pragma once
 
 #include <drjit/color.h>
@@ -11,24 +11,26 @@
 
 namespace mitsuba::nma_plugin {
 
-// An array of pixels, in rows of `width` pixels, with `channels` numbers each. A single number or colour is one pixel.
+// An array of pixels, in rows of `width` pixels. Each pixel has `channels` numbers. A single number or colour is one
+// pixel.
 struct Texels {
     std::vector<float> numbers;
     std::size_t width = 1, channels = 1;
-    // Whether Mitsuba stores the numbers as bytes.
+    // Whether Mitsuba stores the pixels as bytes.
     bool bytes = false;
 
     std::size_t pixels() const { return numbers.size() / channels; }
 };
 
-// Finds all arrays, numbers and colours that a texture, and textures inside it, show as `data` and `value`.
+// Finds all arrays, numbers and colours that a texture, or a texture nested in it, exposes to `traverse` under the
+// names `data` and `value`.
 template <class Float>
 class TexelFinder final : public TraversalCallback {
 public:
     explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
 
     std::vector<Texels> found;
-    // Whether each of these textures showed numbers. Mesh attributes, for example, have none before rendering.
+    // Whether every texture exposed numbers. Mesh attributes, for example, have no numbers before rendering.
     bool complete = true;
 
 protected:
@@ -54,7 +56,8 @@ protected:
     }
 
 private:
-    // Stores the pixels if `value` is an array (height, width, channels) of numbers of type T. Returns whether it is.
+    // If `value` is an array (height, width, channels) of numbers of type T, stores its pixels and returns true.
+    // Otherwise returns false.
     template <class T>
     bool pixels(void* value, const std::type_info& type) {
         using Tensor = dr::Tensor<dr::DynamicArray<T>>;
@@ -64,7 +67,7 @@ private:
                       tensor.ndim() > 1 ? tensor.shape(1) : 1,
                       tensor.ndim() > 2 ? tensor.shape(2) : 1,
                       std::is_same_v<T, uint8_t>};
-        // Mitsuba stores bytes as they are in the file. On a lookup it decodes them from sRGB, unless the texture is
+        // Mitsuba stores the bytes of the image file unchanged. A lookup decodes them from sRGB, unless the texture is
         // `raw`.
         const bool srgb = texels.bytes && shown_->to_string().find("raw = 1") == std::string::npos;
         for (std::size_t k = 0; k < tensor.size(); ++k) {

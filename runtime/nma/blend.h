@@ -1,7 +1,8 @@
-// A blend of Principled BRDFs: its value, and one density and one sample over all its lobes. Twin of
-// nma/target/blend.py.
+// A blend of Principled BRDFs: its value, and a density and a sampling function that cover all its lobes.
+// nma/target/blend.py is the Python version of this code.
 //
-// Directions are unit vectors in the local frame, z up, `wi` towards the viewer and `wo` towards the light.
+// Directions are unit vectors in the local frame, with z up. `wi` points towards the viewer, and `wo` towards the
+// light.
 #pragma once
 
 #include "generated/target.h"
@@ -11,26 +12,27 @@ namespace nma {
 
 constexpr int MAX_PACKS = 2, MAX_INSTANCES = MAX_PACKS * LANES;
 
-// The probability that a sample is drawn from each lobe of an instance.
+// The lobe probabilities of an instance: for each lobe, the probability that a sample is drawn from it.
 template <class T>
 struct LobeProbabilities {
     T diffuse, spec, clearcoat;
 };
 
-// Four instances side by side, with their weights and their lobe probabilities. A lane without an instance holds zeros.
+// Four instances with their weights and their lobe probabilities, one instance per lane. A lane without an instance
+// holds zeros.
 template <class T>
 struct Pack {
     Principled<Lanes<T>> instances;
     Lanes<T> weights;
     LobeProbabilities<Lanes<T>> probabilities;
 
-    // All numbers of the pack as an array, in the order above: first the fields of the instances.
+    // All numbers of the pack as an array, in the order of the members above.
     Lanes<T>* as_array() { return reinterpret_cast<Lanes<T>*>(this); }
     const Lanes<T>* as_array() const { return reinterpret_cast<const Lanes<T>*>(this); }
 };
 
-// Instances and their weights, which sum to 1. `set_lobe_probabilities` fills in the lobe probabilities. It also fills
-// in `scale`, the factor of the blend's value in each colour channel.
+// Instances and their weights, which sum to 1. `set_lobe_probabilities` fills in the lobe probabilities and `scale`.
+// The value of the blend is multiplied by `scale`, a factor for each colour channel.
 template <class T>
 struct Blend {
     int count = 0;
@@ -40,7 +42,7 @@ struct Blend {
     Blend() = default;
     explicit Blend(int instances) : count(instances), scale{T(1), T(1), T(1)} { std::fill_n(packs, used(), Pack<T>{}); }
 
-    // The count of packs that hold instances.
+    // The count of packs that contain instances.
     int used() const { return (count + LANES - 1) / LANES; }
 
     void set(int k, const Principled<T>& instance, T weight) {
@@ -78,13 +80,13 @@ struct Sample {
     T pdf;
 };
 
-// Fills in the lobe probabilities at cos(theta_i), which follow the estimated albedos of the lobes. If `bounded`, also
-// fills in `scale`, so that the blend reflects no more light than it receives.
+// Fills in the lobe probabilities at cos(theta_i), in proportion to the estimated albedos of the lobes. If `bounded` is
+// true, also fills in `scale`, so that the blend reflects no more light than it receives.
 template <class T>
 inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded) {
     const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
-    // Lanes 0 to 2 hold the albedo of the blend in red, green and blue. Lane 3 holds their sum, which is three times
-    // the sum of all probabilities before they are normalised.
+    // Lanes 0 to 2 of `sum` hold the albedo of the blend in red, green and blue. Lane 3 holds the sum of these three
+    // albedos, which is three times the sum of all probabilities before they are normalised.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
@@ -103,14 +105,15 @@ inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded)
     if (bounded) blend.scale = {inverse[0], inverse[1], inverse[2]};
 }
 
-// Copies a geometry to all lanes.
+// Copies each number of a geometry to all lanes.
 template <class T>
 inline Geometry<Lanes<T>> spread(const Geometry<T>& g) {
     const auto all = [](const Vec3<T>& v) { return Vec3<Lanes<T>>{v.x, v.y, v.z}; };
     return {g.valid, all(g.wi), all(g.wo), all(g.h), g.cos_d, g.weight_i, g.weight_o, g.weight_d, g.clearcoat};
 }
 
-// The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. Both are 0 below the horizon.
+// The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. The value and the density are 0 below the
+// horizon.
 template <class T>
 inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
     Evaluation<T> result;
@@ -128,9 +131,9 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
     return result;
 }
 
-// The index of the instance that `u` chooses. From `start` on, each instance has an interval as long as the probability
-// of its `lobe`, and `u` lies in the interval of the chosen one. Moves `start` to the end of that interval. Returns
-// `count` if `u` lies beyond all intervals.
+// The index of the instance that `u` chooses. From `start` on, each instance has an interval whose length is the
+// probability of its `lobe`. The chosen instance is the one whose interval contains `u`. Moves `start` to the end of
+// that interval. Returns `count` if `u` lies beyond all intervals.
 template <class T>
 inline int chosen(const Blend<T>& blend, Lanes<T> LobeProbabilities<Lanes<T>>::* lobe, T u, T& start) {
     int k = 0;
@@ -138,11 +141,12 @@ inline int chosen(const Blend<T>& blend, Lanes<T> LobeProbabilities<Lanes<T>>::*
     return k;
 }
 
-// Draws a direction from three uniform numbers in [0, 1). Returns it with its value and its density.
+// Draws a direction from three uniform numbers in [0, 1). Returns the direction with its value and its density.
 template <class T>
 inline Sample<T> sample(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1, T u2) {
     if (!(wi.z > MIN_COS<T>)) return {{T(0), T(0), T(1)}, {T(0), T(0), T(0)}, T(0)};
-    // In the order of `u_lobe`, all diffuse lobes come first, then all specular lobes, then all clearcoats.
+    // `u_lobe` chooses the lobe. Small values choose diffuse lobes, larger values specular lobes, and the largest
+    // values clearcoats.
     T end = T(0);
     for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].probabilities.diffuse);
     Vec3<T> wo;

@@ -1,4 +1,5 @@
-// The BRDF for a view direction: a blend in the frame in which it holds. Twin of nma/target/brdf.py.
+// The BRDF for a view direction: a blend, and the frame in which it is evaluated. nma/target/brdf.py is the Python
+// version of this code.
 #pragma once
 
 #include "blend.h"
@@ -9,24 +10,24 @@ using Direction = Vec3<float>;
 using Value = Evaluation<float>;
 using Sampled = Sample<float>;
 
-// The BRDF at one shading point. It holds for the cos(theta_i) that it was prepared for. If the adapter is anisotropic,
-// it holds for that `wi` only.
+// The BRDF at one shading point. It is valid only for view directions with the cos(theta_i) that it was prepared for.
+// If the adapter is anisotropic, the BRDF is valid only for the `wi` that it was prepared for.
 class Brdf {
 public:
-    // The value f cos(theta_o) [1/sr], 0 below the horizon.
+    // The value f cos(theta_o) [1/sr], which is 0 below the horizon.
     Vec3<float> eval(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).value; }
 
-    // The density of `sample` [1/sr], 0 below the horizon.
+    // The density [1/sr] with which `sample` draws `wo`, which is 0 below the horizon.
     float pdf(const Direction& wi, const Direction& wo) const { return eval_pdf(wi, wo).pdf; }
 
-    // The value and the density together. This takes no longer than one of them.
+    // The value and the density. The call takes no longer than `eval` alone or `pdf` alone.
     Value eval_pdf(const Direction& wi, const Direction& wo) const {
         const Plane<float> plane = frame(wi);
         return nma::eval_pdf(blend_, plane_enter<float>(plane, wi), plane_enter<float>(plane, wo));
     }
 
-    // A direction from three uniform numbers in [0, 1), with its value and its density. A density of 0 marks an invalid
-    // direction.
+    // Draws a direction from three uniform numbers in [0, 1), and returns it with its value and its density. A density
+    // of 0 marks an invalid direction.
     Sampled sample(const Direction& wi, float u_lobe, float u1, float u2) const {
         const Plane<float> plane = frame(wi);
         Sampled found = nma::sample(blend_, plane_enter<float>(plane, wi), u_lobe, u1, u2);
@@ -34,7 +35,7 @@ public:
         return found;
     }
 
-    // The directional albedo at `wi`, at most 1, as RGB. Denoisers ask for it. It is the mean of value / pdf over
+    // The directional albedo at `wi` as RGB, at most 1, for denoisers. The albedo is the mean of value / pdf over
     // samples at fixed points (Roberts 2018, "R2").
     Vec3<float> albedo(const Direction& wi, int points = 128) const {
         const auto fraction = [](float x) { return x - std::floor(x); };
@@ -55,8 +56,9 @@ private:
     friend class Adapter;
     friend class Curves;
 
-    // The frame in which the blend holds. Lobes that were trained in the plane of incidence stretch along that plane.
-    // Each call finds the plane again, because a BRDF that was prepared for a cosine serves all azimuths.
+    // The frame in which the blend is evaluated. If the lobes were trained in the plane of incidence, they are
+    // anisotropic along that plane. Each call computes the plane from `wi`, because a BRDF that was prepared for a
+    // cosine is used for all azimuths.
     Plane<float> frame(const Direction& wi) const { return in_plane_ ? plane_of<float>(wi) : Plane<float>{1.0f, 0.0f}; }
 
     Blend<float> blend_;

@@ -1,5 +1,5 @@
-// The inputs of the network: the parameters of a material and the view direction, turned into numbers of about unit
-// size. Twin of nma/adapter/encoding.py.
+// Computes the inputs of the network, which are numbers of about unit size, from the parameters of a material and the
+// view direction. nma/adapter/encoding.py is the Python version of this code.
 #pragma once
 
 #include "generated/constants.h"
@@ -27,7 +27,7 @@ public:
         }
     }
 
-    // The count of numbers that `encode` reads as parameters.
+    // The count of numbers that `encode` reads as the parameters of a material.
     int parameters() const { return parameters_; }
     // The count of inputs that the network was trained on.
     int size() const {
@@ -42,11 +42,11 @@ public:
                 return 13 + 3 * directional_;
         }
     }
-    // Whether the azimuth of `wi` matters. If not, `encode` reads wi.z alone.
+    // Whether the inputs depend on the azimuth of `wi`. If they do not, `encode` reads only wi.z.
     bool anisotropic() const { return kind_ == Kind::Azimuth; }
 
-    // The first layer of a file, changed so that it takes the inputs in the order in which `encode` writes them. Only
-    // the encoding `layered3` changes the layer: `place` shows its two orders.
+    // Reorders the inputs of `first`, the first layer of a file, to the order in which `encode` writes them. The orders
+    // differ only for the encoding `layered3`: see `place`.
     Layer arranged(const Layer& first) const {
         if (kind_ != Kind::Layered3) return first;
         Layer made{4 * LANES, first.out, std::vector<float>(4 * LANES * static_cast<std::size_t>(first.out)),
@@ -56,7 +56,7 @@ public:
         return made;
     }
 
-    // Writes the inputs to `x`, and zeros after them up to `stride` numbers. `p` holds the parameters.
+    // Writes the inputs for the parameters `p` to `x`, and fills `x` with zeros up to `stride` numbers.
     void encode(const float* p, const Vec3<float>& wi, float* x, int stride) const {
         if (kind_ == Kind::Layered3) return layered3(p, wi.z, x);
         float* const end = x + stride;
@@ -83,23 +83,24 @@ private:
         throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
     }
 
-    // The parameter of this name, which must have one number.
+    // The parameter called `name`. Throws unless this parameter exists and has one number.
     static const SourceParam& scalar(const Weights& weights, const char* name) {
         for (const SourceParam& p : weights.parameters)
             if (p.name == name && p.size == 1) return p;
         throw Error(WRONG_CLASS);
     }
 
-    // Where `encode` puts input i of the encoding `layered3`. In the order of training, the inputs are four scalars,
-    // three colours and three numbers that depend on the direction. `encode` computes vectors of four lanes, so each
-    // colour gets one number of the direction as its fourth lane:
+    // The position to which `encode` writes input i of the encoding `layered3`. In the order of training, the inputs
+    // are four scalars s0 .. s3, three colours (r, g, b) and three numbers d0 .. d2 that depend on the direction.
+    // `encode` computes vectors of four lanes, so each colour gets one of the numbers d0 .. d2 as its fourth lane:
     //
     //     order of training    s0 s1 s2 s3  r0 g0 b0  r1 g1 b1  r2 g2 b2  d0 d1 d2
     //     order of `encode`    s0 s1 s2 s3  r0 g0 b0 d0  r1 g1 b1 d1  r2 g2 b2 d2
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
 
-    // Writes sin(theta_i) times cosine and sine of the azimuth phi, and sin^2(theta_i) times cosine and sine of 2 phi.
-    // The factors fade towards normal incidence, which has no azimuth. Returns the end of what it wrote.
+    // Writes sin(theta_i) times the cosine and the sine of the azimuth phi, and sin^2(theta_i) times the cosine and the
+    // sine of 2 phi. These factors go to 0 towards normal incidence, which has no azimuth. Returns a pointer to the end
+    // of the written numbers.
     static float* azimuth(const Vec3<float>& wi, float* x) {
         const float numbers[] = {wi.x, wi.y, wi.x * wi.x - wi.y * wi.y, 2.0f * wi.x * wi.y};
         return std::copy_n(numbers, 4, x);
@@ -108,14 +109,15 @@ private:
     NMA_INLINE void layered3(const float* p, float cosine, float* x) const {
         using Four = Lanes<float>;
         const float sigma_t = p[layered3::SIGMA_T], eta_top = p[layered3::ETA_TOP];
-        // This takes longest, so it comes first.
+        // The Fresnel reflectance comes first, because it takes the most time.
         const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
         const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, MIN_COS_T)), Four(-87.0f)));
         const Four one(1.0f), inside(1.0f / eta_top);
         const Four n = four(p + layered3::ETA_CONDUCTOR) * inside, k = four(p + layered3::K_CONDUCTOR) * inside;
         const Four k2 = k * k, less = n - one, more = n + one;
         Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
-        // `fresnel_conductor` at normal incidence: |eta - 1|^2 / |eta + 1|^2 for the complex index eta = n + i k.
+        // `normal` is `fresnel_conductor` at normal incidence: |eta - 1|^2 / |eta + 1|^2 for the complex index eta = n
+        // + i k.
         Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + layered3::ALBEDO);
         const Four plain{p[layered3::ALPHA_TOP], p[layered3::ALPHA_BOTTOM], eta_top, sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;
@@ -128,7 +130,7 @@ private:
         put(x + 3 * LANES, albedo);
     }
 
-    // Stores four numbers, moved from the range 0 .. 1 to the range -1 .. 1.
+    // Maps four numbers from 0 .. 1 to -1 .. 1, and stores them at `x`.
     static void put(float* x, const Lanes<float>& units) {
         const Lanes<float> spread = units * Lanes<float>(2.0f) - Lanes<float>(1.0f);
         std::memcpy(x, &spread, sizeof(spread));
@@ -143,8 +145,8 @@ private:
     Kind kind_ = Kind::Raw;
     bool directional_ = false;
     int parameters_ = 0;
-    // One lane for each of the four scalar parameters x of `layered3`. (y - start) per_range lies in 0 .. 1, with y =
-    // log(x) where `log_` is 1 and y = x where it is 0.
+    // These vectors have one lane for each of the four scalar parameters x of `layered3`. y is log(x) where `log_` is
+    // 1, and x where `log_` is 0. (y - start_) * per_range_ lies in 0 .. 1.
     Lanes<float> log_{0.0f}, start_{0.0f}, per_range_{0.0f};
 };
 

@@ -5,7 +5,7 @@
 
 namespace nma {
 
-// The message says what is wrong with a file, where, and what to do about it.
+// The message of this exception says what is wrong, where the fault is in the weights file, and how to repair it.
 struct Error : std::runtime_error {
     using std::runtime_error::runtime_error;
 };

@@ -1,7 +1,8 @@
-// A strict reader for JSON (RFC 8259), as far as weights files need it. It returns a tree of values of limited depth.
+// A strict reader for JSON (RFC 8259), with the features that weights files need. It returns a tree of values of
+// limited depth.
 //
-// An object keeps its names and its items in two vectors, because std::pair may not hold the type `Json` before that
-// type is complete; std::vector may.
+// An object stores its names and its items in two vectors. One vector of pairs is not possible, because std::pair,
+// unlike std::vector, must not contain the type `Json` before that type is complete.
 #pragma once
 
 #include <cstdint>
@@ -25,19 +26,19 @@ struct Json {
     double number = 0.0;
     std::string string;
     std::vector<Json> items;         // the items of an array or of an object, in order
-    std::vector<std::string> names;  // the names of an object's items
+    std::vector<std::string> names;  // the names of an object's items, in the same order
 
-    // The item called `name`, or null.
+    // The item called `name`, or null if there is no such item.
     const Json* find(std::string_view name) const {
         for (std::size_t k = 0; k < names.size(); ++k)
             if (names[k] == name) return &items[k];
         return nullptr;
     }
 
-    // The item called `name`. Throws unless it exists and is of the expected kind.
+    // The item called `name`. Throws unless this item exists and is of the expected kind.
     const Json& at(std::string_view name, Kind expected) const {
         const Json* found = find(name);
-        if (!found || found->kind != expected) throw Error("its metadata lacks a valid '" + std::string(name) + "'");
+        if (!found || found->kind != expected) throw Error("the metadata lacks a valid '" + std::string(name) + "'");
         return *found;
     }
 
@@ -53,7 +54,7 @@ public:
     Json document() {
         Json value = this->value(0);
         space();
-        if (place_ != text_.size()) fail("text follows its end");
+        if (place_ != text_.size()) fail("text after the end");
         return value;
     }
 
@@ -151,7 +152,8 @@ private:
         while (place_ < text_.size() &&
                std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos)
             ++place_;
-        // A stream with this locale reads "." as the decimal point. strtod would follow the locale of the host program.
+        // A stream with the classic locale reads "." as the decimal point, whereas strtod would use the locale of the
+        // host program.
         std::istringstream digits(std::string(text_.substr(first, place_ - first)));
         digits.imbue(std::locale::classic());
         double found = 0.0;
@@ -185,13 +187,14 @@ private:
         std::uint32_t code = 0;
         for (int k = 0; k < 4; ++k, ++place_) {
             const auto digit = std::string_view("0123456789abcdef").find(static_cast<char>(peek() | 0x20));
-            if (digit == std::string_view::npos) fail("four hexadecimal digits were expected");
+            if (digit == std::string_view::npos) fail("not four hexadecimal digits");
             code = 16 * code + static_cast<std::uint32_t>(digit);
         }
         return code;
     }
 
-    // A code unit as UTF-8. The two halves of a surrogate pair are not joined: no field that the runtime reads has any.
+    // A UTF-16 code unit as UTF-8. The two halves of a surrogate pair are not joined, because no field that the runtime
+    // reads has surrogate pairs.
     static std::string utf8(std::uint32_t code) {
         const auto tail = [](std::uint32_t bits) { return static_cast<char>(0x80 | (bits & 0x3F)); };
         if (code < 0x80) return {static_cast<char>(code)};

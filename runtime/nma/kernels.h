@@ -1,9 +1,10 @@
-// `Adapter::prepare` for each instruction set. The choice is made at run time, so one binary serves all CPUs.
+// The functions of `Adapter::prepare` for each instruction set. The instruction set is chosen at run time, so one
+// binary runs on all CPUs.
 //
-// Each instruction set compiles the same code, kernels/body.inl, for its own vector type. avx512_bf16 alone runs the
-// network with its own code, which rounds weights and activations to bfloat16. Some compilers fail on that code (clang
-// 16 does at -O1): the macro NMA_NO_AVX512_BF16 leaves it out. The macro NMA_PORTABLE_ONLY leaves out everything except
-// the portable code.
+// The code in kernels/body.inl is compiled for the vector type of each instruction set. Only avx512_bf16 has its own
+// code for the network (kernels/avx512_bf16.h), which rounds weights and activations to bfloat16. Some compilers crash
+// on that file, such as clang 16 at -O1. The macro NMA_NO_AVX512_BF16 leaves out that file. The macro NMA_PORTABLE_ONLY
+// leaves out the code of all instruction sets except `portable`.
 #pragma once
 
 #include <cstdint>
@@ -27,7 +28,7 @@
 
 namespace nma {
 
-// The slowest comes first.
+// The instruction sets, from the slowest to the fastest.
 enum class InstructionSet { portable, neon, avx2, avx512, avx512_bf16 };
 
 constexpr InstructionSet INSTRUCTION_SETS[] = {InstructionSet::portable, InstructionSet::neon, InstructionSet::avx2,
@@ -42,8 +43,8 @@ namespace detail {
 
 #ifdef NMA_X86
 #if defined(_MSC_VER)
-// Whether the CPU and the operating system support `set`. The answer is in leaves 1 and 7 of CPUID and in the extended
-// control register.
+// Whether the CPU and the operating system support `set`. Leaves 1 and 7 of CPUID tell what the CPU supports, and the
+// extended control register tells what the operating system supports.
 inline bool cpu_has(InstructionSet set) {
     int leaf1[4], leaf7[4], leaf7_1[4];
     __cpuid(leaf1, 1);
@@ -92,27 +93,29 @@ inline InstructionSet fastest() {
     return InstructionSet::portable;
 }
 
-// The functions for one instruction set. A row of inputs has the padded input count of the first layer, with zeros at
-// the end. A row of outputs has the padded width of the last layer, and is aligned to 64 bytes.
+// The functions for one instruction set. The inputs of a query are a row of floats, filled with zeros up to the padded
+// input count of the first layer. The outputs of a query are a row whose length is the padded width of the last layer,
+// aligned to 64 bytes.
 struct Kernels {
     InstructionSet set;
     // Runs the network for one query.
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
-    // Runs the network for many queries, a row each.
+    // Runs the network for many queries, each of which has a row of inputs and a row of outputs.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
-    // `encode` fills in a row of inputs. `decode` makes a blend of a row of outputs `raw`, which it overwrites.
-    // `set_lobe_probabilities` then completes the blend. It is apart from `decode` because its vectors are narrow. Some
-    // CPUs have fewer units for their widest vectors, and run narrow vectors among wide ones at half the speed. So
-    // batches call `decode` for all queries first, and then `set_lobe_probabilities`.
+    // `encode` fills in a row of inputs. `decode` makes a blend of `raw`, a row of outputs, and overwrites `raw`.
+    // `set_lobe_probabilities` then completes the blend. `decode` uses wide vectors, and `set_lobe_probabilities` uses
+    // narrow vectors. Some CPUs run narrow vector instructions at half the speed while wide vector instructions are
+    // running. So `prepare_many` calls `decode` for all queries of a block first, and then `set_lobe_probabilities` for
+    // all of them.
     void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
     void (*decode)(const Preparation&, float* raw, float cosine, Blend<float>&);
     void (*set_lobe_probabilities)(const Preparation&, float cosine, Blend<float>&);
-    // All steps for one query.
+    // Runs all steps for one query.
     void (*prepare)(const Preparation&, const float* parameters, const Vec3<float>& wi, Blend<float>&);
 };
 
-// The kernels of `set`, or the portable kernels if `set` cannot run here.
+// The functions for `set`, or the portable functions if this CPU does not support `set`.
 inline const Kernels& kernels(InstructionSet set) {
     static constexpr Kernels PORTABLE{InstructionSet::portable,
                                       portable::forward,

@@ -1,8 +1,8 @@
-// Four numbers side by side. The functions of generated/target.h take `Lanes<T>` in place of T, and so evaluate four
-// instances at once.
+// `Lanes<T>` is a vector of four numbers of type T. With `Lanes<T>` as their number type, the functions of
+// generated/target.h evaluate four instances at once.
 //
-// With GCC and Clang, four floats are a vector of the instructions that every CPU of the target has. Four doubles, and
-// four floats with other compilers, are loops over an array.
+// With GCC and Clang, four floats are a vector register of the instruction set that every CPU of the target
+// architecture has. Four doubles are an array, and with other compilers four floats are an array, too.
 #pragma once
 
 #include <cstdint>
@@ -21,7 +21,7 @@ constexpr int LANES = 4;
 
 namespace detail {
 
-// Four numbers in an array, for types and compilers without vectors.
+// Four numbers in an array, for types and compilers without vector registers.
 template <class T>
 struct Four {
     T lane[LANES];
@@ -107,8 +107,9 @@ inline Floats sums(Floats a, Floats b, Floats c, Floats d) {
 }
 #endif
 
-// Natural logarithms, to two units in the last place for normal numbers. 0 gives a number below -88. The mantissa m is
-// brought to sqrt(1/2) .. sqrt(2). Then log(m) = 2 artanh(s) for s = (m - 1) / (m + 1), computed as a series in s.
+// Natural logarithms, to two units in the last place for normal numbers. The result for 0 is less than -88. The
+// argument is split into a power of 2 and a mantissa m in sqrt(1/2) .. sqrt(2). The logarithm of m is 2 artanh(s) with
+// s = (m - 1) / (m + 1), which is computed as a power series in s.
 inline Floats logarithms(Floats a) {
     const Whole bits = (Whole)a, halves = (bits - 0x3f3504f3) >> 23;
     const Floats m = (Floats)(bits - (halves << 23)), exponent = __builtin_convertvector(halves, Floats);
@@ -117,8 +118,8 @@ inline Floats logarithms(Floats a) {
     return exponent * 0.693147181f + (2.0f * s + s * series);
 }
 
-// e^a, to two units in the last place for |a| <= 87: 2^n for a whole number n, times a series in the rest, which is at
-// most log(2) / 2.
+// e^a, to two units in the last place for |a| <= 87. It is computed as 2^n e^r with a whole number n and r = a - n
+// log(2), where |r| is at most log(2) / 2 and e^r is a power series.
 inline Floats exponentials(Floats a) {
     const Floats octaves = a * 1.44269504f;
     const Floats half = octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f};
@@ -164,7 +165,7 @@ template <class T> inline Lanes<T> exp(const Lanes<T>& a) { return detail::expon
 template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(maximum(a, Lanes<T>(T(0)))); }
 
 template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
-// The sums of a, b, c and d, side by side.
+// A vector of four numbers: the sums of the lanes of a, b, c and d.
 template <class T> inline Lanes<T> sums(const Lanes<T>& a, const Lanes<T>& b, const Lanes<T>& c, const Lanes<T>& d) {
     return detail::sums(a.v, b.v, c.v, d.v);
 }

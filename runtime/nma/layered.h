@@ -1,9 +1,9 @@
-// The layered material itself: random walks simulate a rough dielectric over a homogeneous medium over a rough
-// conductor. Scalar twin of nma/sources/layered.py and nma/sources/layered_eval.py, which explain the method (Guo,
-// Hasan and Zhao 2018, "position-free").
+// The simulated layered material: a rough dielectric interface over a homogeneous medium over a rough conductor,
+// simulated by random walks. This file is the scalar version of nma/sources/layered.py and nma/sources/layered_eval.py,
+// which explain the method (Guo, Hasan and Zhao 2018, "position-free").
 //
-// Directions are unit vectors in the local frame, z up. Values are f cos(theta_o) [1/sr], with noise. Densities are per
-// sr.
+// Directions are unit vectors in the local frame, with z up. Values are noisy estimates of f cos(theta_o) [1/sr].
+// Densities are per sr.
 #pragma once
 
 #include <cstdint>
@@ -15,7 +15,7 @@ namespace nma::layered {
 
 using Vec = Vec3<float>;
 
-// Random numbers of O'Neill 2014, "PCG": 64 bits of state, 32 of output (XSH-RR).
+// The random number generator PCG of O'Neill 2014, with 64 bits of state and 32 bits of output (XSH-RR).
 class Random {
 public:
     Random(std::uint64_t state, std::uint64_t stream) : increment_(stream << 1 | 1) {
@@ -32,21 +32,21 @@ public:
         return mixed >> turn | mixed << (-turn & 31);
     }
 
-    // Uniform in [0, 1).
+    // A uniform number in [0, 1).
     float uniform() { return static_cast<float>(next() >> 8) * 0x1p-24f; }
 
 private:
     std::uint64_t state_ = 0, increment_;
 };
 
-// The interfaces and the medium. `eta_bottom` and `k_bottom` are the conductor's index of refraction divided by the
-// coat's, per colour channel.
+// The interfaces and the medium of the layered material. `eta_bottom` and `k_bottom` are the conductor's complex index
+// of refraction divided by that of the coat, per colour channel.
 struct Stack {
     float alpha_top, alpha_bottom, eta_top;
     Vec eta_bottom, k_bottom, albedo;
     float sigma_t;
 
-    // The stack for a parameter vector of the class `layered3`.
+    // The stack that a parameter vector of the class `layered3` describes.
     static Stack of(const float* p) {
         using namespace layered3;
         const auto colour = [p](int first) { return Vec{p[first], p[first + 1], p[first + 2]}; };
@@ -56,7 +56,7 @@ struct Stack {
     }
 };
 
-// A walk: where it is heading, its throughput, and its height in the slab (1 at the top, 0 at the bottom).
+// A walk: its direction, its throughput, and its height in the slab (1 at the top, 0 at the bottom).
 struct Walk {
     Vec direction, throughput;
     float height;
@@ -68,7 +68,7 @@ namespace detail {
 inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)); }
 // `w` moved slightly above the horizon, where visible normals are undefined.
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
-// The inverse of a density, which is large for a wide lobe. `unscattered` weighs its connections by it.
+// The inverse of a density. It is large for a wide lobe. `unscattered` computes the weights of connections from it.
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
 // The reflectance of the conductor, per colour channel.
@@ -78,12 +78,13 @@ inline Vec conductor(float cosine, const Stack& stack) {
             fresnel_conductor<float>(cosine, eta.z, k.z)};
 }
 
-// The fraction of light along `w` that passes `depth` of the slab without meeting the medium. 1 is the whole slab.
+// The fraction of the light along `w` that crosses a layer of the slab without scattering or absorption. `depth` is the
+// thickness of that layer, as a fraction of the slab.
 inline float transmittance(const Stack& stack, float depth, const Vec& w) {
     return stack.sigma_t > 0.0f ? exp(-stack.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
 }
 
-// Russian roulette on the brightest channel. `exempt` walks always survive.
+// Russian roulette on the brightest channel. Walks with `exempt` always survive.
 inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     if (exempt) return;
     const float chance =
@@ -97,8 +98,9 @@ inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     walk.alive = chance > 0.0f;
 }
 
-// Advances a walk by one free flight through a medium of extinction `sigma_t`, and by the event at its end: a
-// scattering or a visit to an interface. Returns whether the walk left the material.
+// Advances a walk by one free flight through a medium of extinction `sigma_t`, and by the event at the end of that
+// flight: scattering in the medium, or reflection or refraction at an interface. Returns whether the walk left the
+// material.
 inline bool step(const Stack& stack, float sigma_t, Walk& walk, Random& random) {
     const Vec d = walk.direction;
     if (walk.inside && sigma_t > 0.0f) {
@@ -144,8 +146,8 @@ inline bool step(const Stack& stack, float sigma_t, Walk& walk, Random& random) 
     return leaves;
 }
 
-// A walk that has come from `w` and is now just below the coat. The walk always refracts, because the light that the
-// coat reflects has a closed form.
+// Starts a walk from the direction `w` just below the coat's surface. The walk is always refracted there, because the
+// light that the coat's surface reflects has a closed form.
 inline Walk enter(const Stack& stack, const Vec& w, Random& random) {
     const float alpha = stack.alpha_top, u1 = random.uniform(), u2 = random.uniform();
     const Vec view = above(w), m = sample_visible_normal<float>(view, alpha, alpha, u1, u2);
@@ -155,18 +157,19 @@ inline Walk enter(const Stack& stack, const Vec& w, Random& random) {
     return {down, {weight, weight, weight}, 1.0f, true, weight > 0.0f};
 }
 
-// A segment of a walk that met interfaces only: its direction, and its throughput divided by the probability that it
-// was chosen.
+// A segment of a walk that did not scatter in the medium. `reached` is the throughput on the segment, divided by the
+// probability that the segment was chosen.
 struct Way {
     Vec direction, reached;
 };
 
-// One segment of a walk after its first segment, chosen by weighted reservoir sampling (Chao 1982).
+// One segment of a walk, other than its first, that is chosen by weighted reservoir sampling (Chao 1982).
 struct Detour {
     Vec direction, tint{0.0f, 0.0f, 0.0f};
     float total = 0.0f;
 
-    // Chooses the current segment of `walk` instead, with a chance in proportion to its brightest channel.
+    // Replaces the chosen segment by the current segment of `walk`, with a probability in proportion to the brightest
+    // channel of its throughput.
     void offer(const Walk& walk, Random& random) {
         const float weight = walk.alive ? max_component(walk.throughput) : 0.0f;
         total += weight;
@@ -177,8 +180,9 @@ struct Detour {
     }
 };
 
-// Two densities of refraction at the coat, returned as (q, t). q [1/sr] is the density of `up` when wo is refracted
-// down at a visible normal. t is the density of wo given `up`, divided by q.
+// Returns two numbers (q, t) for light that leaves through the coat's surface: it goes up along `up` inside of the
+// coat, and along wo outside. q [1/sr] is the density of `up` if a walk from wo is refracted at a visible normal. q t
+// [1/sr] is the value of the refraction from `up` to wo, which is transmitted radiance times cos(theta_o).
 inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& wo, const Vec& up) {
     const float alpha = stack.alpha_top, eta = stack.eta_top;
     const bool matched = eta == 1.0f;
@@ -192,7 +196,8 @@ inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& w
     return {matched ? 0.0f : visible_normal_pdf<float>(above(wo), m, alpha, alpha) * (eta * eta) * cos_up / length2, t};
 }
 
-// The approximate density [1/sr] of the conductor's reflection from `w_in` to `up`. It is the same in reverse.
+// The approximate density [1/sr] of the conductor's reflection from `w_in` to `up`. The density from `up` to `w_in` is
+// the same.
 inline float sharpness(const Stack& stack, const Vec& w_in, const Vec& up) {
     return 0.25f * ggx_d<float>(normalize(w_in + up), stack.alpha_bottom, stack.alpha_bottom);
 }
@@ -203,11 +208,14 @@ inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
     return visible_normal_pdf<float>(w, m, alpha, alpha) / (4.0f * maximum(dot(w, m), 1e-7f));
 }
 
-// Light from wi to wo that meets interfaces only. Sets `detour` to one segment of the walk `there` after its first.
+// Estimates the light from wi to wo that does not scatter in the medium. Sets `detour` to one segment of the walk
+// `there`, other than its first.
 //
-// A path is sampled from both ends: `there` starts at wi, `back` at wo. All events are drawn except one, the
-// connection. There the two ends meet, and the density of the event is evaluated. `share` is the weight of one
-// connection among all that could make the same path: it is large where the event is blunt.
+// A path is sampled from both ends: the walk `there` starts at wi, and the walk `back` starts at wo. A connection joins
+// a segment of `there` to the first segment of `back`, or to wo. The walks draw all events of the path at random except
+// the connection, for which the function evaluates its scattering density instead. Several choices of the connection
+// could make the same path. `share` is the multiple importance sampling weight of one choice. It is large if the
+// density at the connection is small, as in a wide lobe.
 inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
                        Random& random, bool forward, Way& detour) {
     const Vec drawn_up = -back.direction;
@@ -225,11 +233,11 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
         walk = before;
         step(stack, 0.0f, walk, random);
         kept.offer(walk, random);
-        // Only visits to the conductor send light to wo.
+        // Skips visits to the coat: only visits to the conductor are connected.
         if (walk.height >= 1.0f) continue;
         const Vec w_in = -before.direction;
         const float rest = way_in + first;
-        // Connect at the last visit to the conductor.
+        // First choice: the connection is the last visit to the conductor.
         float blunt = bluntness(sharpness(stack, w_in, drawn_up));
         float share = matched ? 1.0f : blunt / (blunt + rest + blunt_q);
         if (!forward && !(first > 0.0f)) share = 0.0f;
@@ -240,7 +248,7 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
                                  smith_g1<float>(drawn_up, stack.alpha_bottom, stack.alpha_bottom);
             total = total + before.throughput * conductor(cosine, stack) * weight;
         }
-        // Connect at the way out through the coat.
+        // Second choice: the connection is the refraction out through the coat.
         blunt = bluntness(sharpness(stack, w_in, walk.direction));
         if (!matched) {
             const auto [q, t] = out_through_coat(stack, wo, walk.direction);
@@ -255,7 +263,8 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
     return total;
 }
 
-// Light that scatters in the medium. Every scattering of the walk is connected to each of the `ways` out.
+// Estimates the light that scatters in the medium. Every scattering event of the walk is connected to each of the
+// segments `ways`.
 inline Vec scattered(const Stack& stack, Walk walk, const Way (&ways)[2], Random& random) {
     Vec total{0.0f, 0.0f, 0.0f};
     if (!(stack.sigma_t > 0.0f)) return total;
@@ -274,7 +283,7 @@ inline Vec scattered(const Stack& stack, Walk walk, const Way (&ways)[2], Random
     return total;
 }
 
-// The direction `w` refracted into a flat coat of index `eta` (Snell's law), turned to point up.
+// The direction `w` refracted into a flat coat of index `eta` (Snell's law), reversed to point up.
 inline Vec refract_flat(const Vec& w, float eta) {
     const float x = w.x / eta, y = w.y / eta;
     return {x, y, sqrt(maximum(1.0f - x * x - y * y, 1e-7f))};
@@ -282,7 +291,7 @@ inline Vec refract_flat(const Vec& w, float eta) {
 
 }  // namespace detail
 
-// f cos(theta_o) [1/sr] of the reflection at the coat's upper side alone.
+// The value f cos(theta_o) [1/sr] of the reflection at the coat's surface alone.
 inline float coat_reflection(const Stack& stack, const Vec& wi, const Vec& wo) {
     const Vec m = normalize(wi + wo);
     const float fresnel = std::get<0>(fresnel_dielectric<float>(maximum(dot(wi, m), 0.0f), stack.eta_top));
@@ -305,8 +314,8 @@ inline Vec evaluate(const Stack& stack, const Vec& wi, const Vec& wo, Random& ra
            coat_reflection(stack, wi, wo);
 }
 
-// One whole walk from `wi` (wi.z > 0). If the walk was absorbed, its throughput is 0. Otherwise its direction is the
-// one in which it left.
+// Simulates one whole walk from `wi` (wi.z > 0). The throughput is 0 if the walk was absorbed. Otherwise `direction` is
+// the direction in which the walk left the material.
 inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     Walk made{-wi, {1.0f, 1.0f, 1.0f}, 1.0f, false, true};
     bool left = false;
@@ -315,9 +324,9 @@ inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     return made;
 }
 
-// The part of `pdf` that depends on wi only. The weights of the three lobes sum to 1: the coat's reflection, the
-// conductor's reflection seen through the coat, and a cosine lobe. `width` belongs to the second lobe, and `inside` is
-// wi refracted into the coat.
+// The numbers of `pdf` that depend on wi only. `coat`, `bottom` and `diffuse` are the weights of three lobes, and sum
+// to 1. The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe.
+// `width` is the roughness of the second lobe, and `inside` is wi refracted into the coat.
 struct Density {
     float coat, bottom, diffuse, width;
     Vec inside;
@@ -340,8 +349,8 @@ struct Density {
     }
 };
 
-// A density of wo [1/sr] similar to that of the walk, for importance sampling and for weighing estimators. Its integral
-// is at most 1, and it is positive for wo.z > 0.
+// A density of wo [1/sr] similar to that of a walk's direction, for importance sampling and for the weights of multiple
+// importance sampling. The integral of the density is at most 1, and the density is positive for wo.z > 0.
 inline float pdf(const Stack& stack, const Density& density, const Vec& wi, const Vec& wo) {
     if (!(wo.z > 0.0f)) return 0.0f;
     const Vec inside_o = detail::refract_flat(wo, stack.eta_top);
@@ -358,8 +367,9 @@ struct Drawn {
 };
 
 // Draws a direction with density `pdf` from three uniform numbers in [0, 1). The weight of the sample is `evaluate`
-// divided by the density, which varies more than the throughput of a walk. But a renderer that recombines samples of
-// several materials needs their exact densities, and a walk has no known density.
+// divided by the density, and has more variance than the throughput of a walk. Renderers that combine samples of
+// several materials need this function, because they need the exact densities of samples, and the density of a walk is
+// unknown.
 inline Drawn sample(const Stack& stack, const Density& density, const Vec& wi, float u_lobe, float u1, float u2) {
     Vec wo;
     if (u_lobe < density.coat) {
@@ -374,7 +384,8 @@ inline Drawn sample(const Stack& stack, const Density& density, const Vec& wi, f
     return {wo, pdf(stack, density, wi, wo)};
 }
 
-// The directional albedo at `wi` (wi.z > 0), at most 1: the mean of a fixed set of walks, so it has no noise.
+// The directional albedo at `wi` (wi.z > 0), at most 1. It is the mean throughput of a fixed set of walks, so it has no
+// noise.
 inline Vec albedo(const Stack& stack, const Vec& wi, int walks = 256) {
     Vec sum{0.0f, 0.0f, 0.0f};
     for (int k = 0; k < walks; ++k) {

@@ -1,5 +1,5 @@
-// The arithmetic of generated/target.h: scalars of type T, which is float, double or `Lanes` (lanes.h), and vectors of
-// three.
+// The arithmetic that generated/target.h uses: on numbers of type T, which is float, double or `Lanes` (lanes.h), and
+// on vectors of three numbers.
 #pragma once
 
 #include <algorithm>
@@ -32,8 +32,8 @@ inline std::uint32_t bits(float x) {
     std::memcpy(&found, &x, sizeof(found));
     return found;
 }
-// With -ffast-math, compilers assume that every number is finite, so these functions look at the bits. Without the
-// sign, the bits of infinity are 0x7f800000, and the bits of NaN are larger.
+// With -ffast-math, compilers assume that every number is finite, so these functions test the bits of the float.
+// Without the sign bit, the bits of infinity are 0x7f800000, and the bits of NaN are larger.
 inline bool is_finite(float x) { return (bits(x) & 0x7fffffff) < 0x7f800000; }
 inline bool is_nan(float x) { return (bits(x) & 0x7fffffff) > 0x7f800000; }
 
@@ -59,7 +59,7 @@ template <class T> inline Vec3<T> operator+(const Vec3<T>& a, T t) { return {a.x
 template <class T> inline T dot(const Vec3<T>& a, const Vec3<T>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 template <class T> inline Vec3<T> normalize(const Vec3<T>& v) { return v * (T(1) / sqrt(dot(v, v))); }
 template <class T> inline T mean(const Vec3<T>& c) { return (c.x + c.y + c.z) * (T(1) / T(3)); }
-// Luminance of linear sRGB (ITU-R BT.709 primaries).
+// The luminance of a colour in linear sRGB (ITU-R BT.709 primaries).
 template <class T> inline T luminance(const Vec3<T>& c) {
     return T(0.212671) * c.x + T(0.715160) * c.y + T(0.072169) * c.z;
 }

@@ -1,4 +1,5 @@
-// The multilayer perceptron: linear layers with ReLU between them, laid out for the kernels.
+// The multilayer perceptron: linear layers with ReLU between them. The weights are stored in the order in which the
+// functions in kernels/ read them.
 #pragma once
 
 #include <memory>
@@ -16,7 +17,7 @@ struct FreeAligned {
     void operator()(void* memory) const { ::operator delete(memory, std::align_val_t(64)); }
 };
 
-// An array of zeros on a boundary of 64 bytes, which the widest vector loads need.
+// An array of zeros, aligned to 64 bytes as the widest vector loads require.
 template <class T>
 std::unique_ptr<T[], FreeAligned> aligned(std::size_t count) {
     T* memory = static_cast<T*>(::operator new(count * sizeof(T), std::align_val_t(64)));
@@ -27,32 +28,32 @@ std::unique_ptr<T[], FreeAligned> aligned(std::size_t count) {
 // The smallest multiple of `step` that is at least `n`.
 constexpr int padded(int n, int step) { return (n + step - 1) / step * step; }
 
-// The float rounded to bfloat16, which is the upper half of its bits. Rounds to nearest, ties to even.
+// Rounds a float to bfloat16, which is the upper half of the float's bits. Rounds to nearest, ties to even.
 inline std::uint32_t bfloat16(float value) { return (bits(value) + 0x7fff + (bits(value) >> 16 & 1)) >> 16; }
 
 }  // namespace detail
 
-// Owns the weights. `view()` points to them, and stays valid when the network is moved.
+// Owns the weights of a network. `view()` has pointers to the weights, which stay valid when the `Network` is moved.
 class Network {
 public:
     Network() = default;
 
-    // Rounds the weights to bfloat16 if `compact` is true or `set` is avx512_bf16. They then take half the memory.
+    // Rounds the weights to bfloat16, which halves their memory, if `compact` is true or `set` is avx512_bf16.
     Network(const std::vector<Layer>& layers, InstructionSet set, bool compact) : kernels_(&kernels(set)) {
         if (layers.size() > DEEPEST_NETWORK)
-            throw Error("its network has more than " + std::to_string(DEEPEST_NETWORK) +
+            throw Error("the network has more than " + std::to_string(DEEPEST_NETWORK) +
                         " layers, which this version cannot run");
         view_.depth = static_cast<int>(layers.size());
         const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
         int in = detail::padded(layers.front().in, INPUT_STEP);
         for (std::size_t k = 0; k < layers.size(); ++k) {
-            // The output layer gets at least one neuron of padding. Its weights and its bias are 0, so it returns 0,
-            // and its range in `Ranges` is 0, so it is decoded to 0. `Adapter::lay_out_lanes` (nma.h) needs such an
-            // output.
+            // The output layer gets at least one neuron of padding, because `Adapter::lay_out_lanes` (nma.h) needs an
+            // output whose decoded value is 0. The decoded value of the padding is 0, because the padding has the range
+            // 0 in `Ranges`.
             const bool last = k + 1 == layers.size();
             const int out = layers[k].out + (last ? 1 : 0);
             if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER)
-                throw Error("its network has a layer of more than " + std::to_string(WIDEST_LAYER) +
+                throw Error("the network has a layer of more than " + std::to_string(WIDEST_LAYER) +
                             " neurons, which this version cannot run");
             LayerView& view = view_.layers[k];
             view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
@@ -71,8 +72,8 @@ public:
     const Kernels& kernels_in_use() const { return *kernels_; }
     const NetworkView& view() const { return view_; }
 
-    // The lengths of a query's inputs and outputs, including the padding. The padding of the inputs must be 0. The
-    // outputs have at least one number of padding, and all their padding is 0.
+    // The counts of a query's inputs and outputs, including the padding. The padding of the inputs must be 0. The
+    // outputs have at least one number of padding, and their whole padding is 0.
     int input_stride() const { return view_.layers[0].in; }
     int output_stride() const { return view_.layers[view_.depth - 1].width; }
 
@@ -83,14 +84,14 @@ public:
     }
 
 private:
-    // A new array of `count` zeros, owned by `kept`.
+    // A new array of `count` zeros. `kept` owns the array.
     template <class T>
     T* room(std::vector<std::unique_ptr<T[], detail::FreeAligned>>& kept, std::size_t count) {
         kept.push_back(detail::aligned<T>(count));
         return kept.back().get();
     }
 
-    // The functions `keep...` copy weights into an order of layout.h, where it is explained.
+    // The functions `keep...` copy weights into the orders that layout.h explains.
     const float* keep(const std::vector<float>& values, int width) {
         float* to = room(floats_, width);
         std::copy(values.begin(), values.end(), to);
@@ -106,7 +107,7 @@ private:
 
     const float* keep_turned(const LayerView& view) {
         float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
-        // In the letters of layout.h: i = 4 b + r and j = 4 g + k.
+        // In the notation of layout.h, i is 4 b + r, and j is 4 g + k.
         for (int i = 0; i < view.in; ++i)
             for (int j = 0; j < view.width; ++j) {
                 const int input = i / 4 * 4 + j % 4, neuron = j / 4 * 4 + (j + i) % 4;

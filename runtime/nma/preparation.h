@@ -1,5 +1,4 @@
-// The data that the kernels of `Adapter::prepare` read, and the step of `prepare` that is written once for all
-// instruction sets.
+// The data that all steps of `Adapter::prepare` read, and `assemble`, a step whose code all instruction sets share.
 #pragma once
 
 #include "blend.h"
@@ -9,23 +8,23 @@
 
 namespace nma {
 
-// Its pointers are to arrays that an `Adapter` owns.
+// The data of an adapter. An `Adapter` owns the arrays that the pointers in this structure point to.
 struct Preparation {
     Encoding encoding;
     NetworkView network;
     Ranges ranges;
     int instances, outputs;  // counts
-    bool bounded;            // whether the blend must not reflect more light than it receives
-    // For each lane of each field of each pack: the index of its number among the decoded outputs. The order is that of
-    // `Pack` in memory. A lane without a number has the index of an output of padding, whose value is 0.
+    bool bounded;            // whether the blend is scaled so that it reflects no more light than it receives
+    // For each lane of each field of each pack, in the order of `Pack` in memory: the index of the decoded output that
+    // the lane holds. A lane that holds no output has the index of an output of padding, whose value is 0.
     const int* outputs_of_lanes;
 };
 
-// Picks the numbers of four lanes from memory, by four indices. `LANES` is the count of lanes of `Lanes` and `Pack`, 4
-// for every instruction set.
+// Reads the numbers of four lanes from memory by their indices. `LANES` is the count of lanes of `Lanes` and `Pack`,
+// which is 4 for every instruction set.
 //
-// `Few` (kernels/avx512.h) is its twin for at most `MOST` numbers, which it picks from registers. The other instruction
-// sets have no such registers. There, `Few` is another name of `Indexed`.
+// `Few` (kernels/avx512.h) has the same call operator, but reads from registers, which hold at most `Few::MOST`
+// numbers. For the other instruction sets, `Few` is another name of `Indexed`.
 struct Indexed {
     static constexpr int MOST = 0;
     const float* numbers;
@@ -37,7 +36,7 @@ struct Indexed {
 };
 
 // Fills in the instances and the weights of a blend. `numbers` holds the decoded outputs. `pick` is an `Indexed` or a
-// `Few` over the same numbers.
+// `Few` that reads the same numbers.
 template <class Pick>
 inline void assemble(const Preparation& preparation, const float* numbers, const Pick& pick, Blend<float>& blend) {
     blend.count = preparation.instances;

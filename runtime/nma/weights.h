@@ -1,5 +1,5 @@
-// Reads the weights file: safetensors whose metadata entry `nma` says how to use the network. Twin of
-// nma/adapter/weights.py.
+// Reads weights files, which are safetensors files whose metadata entry `nma` says how to use the network.
+// nma/adapter/weights.py is the Python version of this code.
 #pragma once
 
 #include <algorithm>
@@ -35,10 +35,11 @@ struct SourceParam {
     int size = 1;
     bool logarithmic = false;
     double low = 0.0, high = 0.0;
-    // (x - start) per_range lies in 0 .. 1 over the range. x is the value, or its logarithm if `logarithmic`.
+    // (x - start) * per_range goes from 0 to 1 over the training range, where x is the parameter, or its natural
+    // logarithm if `logarithmic` is true.
     float start = 0.0f, per_range = 1.0f;
 
-    // Whether x is finite and in the range. A rounding error beyond an end is allowed.
+    // Whether x is finite and in the range. A number may exceed an end of the range by a rounding error.
     bool allows(float x) const {
         const double slack = ROUNDING * minimum(high - low, 1.0);
         return is_finite(x) && x >= low - slack && x <= high + slack;
@@ -50,7 +51,7 @@ struct SourceParam {
     }
 };
 
-// Whether x equals `known`, a number of a material, within the rounding to single precision.
+// Whether x equals `known`, a parameter of a single material, apart from rounding to single precision.
 inline bool same(float x, float known) { return is_finite(x) && absolute(x - known) <= SAME * absolute(known) + 1e-8f; }
 
 struct Weights {
@@ -60,43 +61,43 @@ struct Weights {
     std::vector<Layer> layers;
     int instances = 0;
     bool directional = false, bounded = false;
-    // The parameters of the material, if the network was fitted to a single one. Empty if the network was trained on a
-    // class, or if the class has no parameters.
+    // The parameters of the single material that the network was fitted to. The vector is empty if the network was
+    // trained on a class, or if the class has no parameters.
     std::vector<float> material;
 };
 
 namespace detail {
 
 constexpr int WIDEST = 4096, DEEPEST = 64;
-// The largest absolute value that an end of a range may have.
+// The largest absolute value that an end of a parameter's range may have.
 constexpr double FARTHEST = 1e6;
-// A double holds all whole numbers up to here.
+// A double represents every whole number up to this value exactly.
 constexpr double MOST_BYTES = 9e15;
 
-// The whole numbers of an array. Throws if a number is not whole or not in 0 .. limit.
+// The items of an array of whole numbers. Throws if an item is not a whole number or not in 0 .. limit.
 inline std::vector<std::uint64_t> whole(const Json& array, double limit) {
     std::vector<std::uint64_t> found;
     for (const Json& item : array.items) {
         if (item.kind != Json::Kind::Number || !(item.number >= 0 && item.number <= limit) ||
             item.number != std::floor(item.number))
-            throw Error("its header has a size that is negative, too large or not a whole number");
+            throw Error("the header has a size that is negative, too large or not a whole number");
         found.push_back(static_cast<std::uint64_t>(item.number));
     }
     return found;
 }
 
-// A tensor in the data: its name, its shape, and the bytes from `first` up to, not including, `last`.
+// A tensor of the file: its name, its shape, and its bytes from `first` up to, not including, `last`.
 struct Place {
     std::string name;
     std::vector<std::uint64_t> shape;
     std::uint64_t first, last;
 };
 
-// Reads a tensor's entry in the header. `size` is the count of bytes of all data.
+// Reads the header's entry for a tensor. `size` is the count of bytes of the data of all tensors.
 inline Place place(const std::string& name, const Json& entry, std::size_t size) {
-    if (entry.kind != Json::Kind::Object) throw Error("its header has no valid entry for tensor " + name);
+    if (entry.kind != Json::Kind::Object) throw Error("the header has no valid entry for tensor " + name);
     if (entry.at("dtype", Json::Kind::String).string != "F32")
-        throw Error("tensor " + name + " is not float32; convert or train it again");
+        throw Error("tensor " + name + " is not float32; convert the file or train again");
     const auto range = whole(entry.at("data_offsets", Json::Kind::Array), MOST_BYTES);
     Place made{name, whole(entry.at("shape", Json::Kind::Array), MOST_BYTES), 0, 0};
     std::uint64_t bytes = sizeof(float);
@@ -112,8 +113,8 @@ inline Place place(const std::string& name, const Json& entry, std::size_t size)
     return made;
 }
 
-// The tensors of a file, in the order of its data. They must fill the data without gaps, because a gap could hide
-// something, or mean that tensors were moved.
+// The tensors of a file, in the order of their data. Throws if there is a gap between tensors, because a file with a
+// gap was damaged or contains unknown data.
 inline std::vector<Place> places(const Json& header, std::size_t size) {
     std::vector<Place> made;
     for (std::size_t k = 0; k < header.names.size(); ++k)
@@ -123,18 +124,20 @@ inline std::vector<Place> places(const Json& header, std::size_t size) {
     std::uint64_t end = 0;
     for (const Place& p : made) {
         if (p.first != end)
-            throw Error("tensor " + p.name + " does not begin where the one before it ends; copy or train it again");
+            throw Error("tensor " + p.name +
+                        " does not begin where the tensor before it ends; copy the file again or train again");
         end = p.last;
     }
-    if (end != size) throw Error("its tensors end before the file does; copy or train it again");
+    if (end != size) throw Error("the tensors end before the file does; copy the file again or train again");
     return made;
 }
 
-// The numbers of a tensor, which must be finite, and its `shape`, which must have `dimensions` sizes.
+// Returns the numbers of a tensor, and writes its sizes to `shape`. Throws if a number is not finite, or if the tensor
+// does not have `dimensions` dimensions.
 inline std::vector<float> tensor(const std::vector<Place>& places, const char* data, const std::string& name,
                                  std::size_t dimensions, std::vector<std::uint64_t>& shape) {
     const auto found = std::find_if(places.begin(), places.end(), [&](const Place& p) { return p.name == name; });
-    if (found == places.end()) throw Error("it lacks tensor " + name + "; copy or train it again");
+    if (found == places.end()) throw Error("the file lacks tensor " + name + "; copy the file again or train again");
     shape = found->shape;
     if (shape.size() != dimensions || *std::max_element(shape.begin(), shape.end()) > WIDEST)
         throw Error("tensor " + name + " has the wrong number of dimensions, or a size above " +
@@ -156,7 +159,7 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
         layer.bias = tensor(places, data, name + ".bias", 1, length);
         if (length[0] != shape[0] || !shape[0] || !shape[1] ||
             (k && shape[1] != static_cast<std::uint64_t>(made.back().out)))
-            throw Error("layer " + std::to_string(k) + " does not fit the one before it");
+            throw Error("layer " + std::to_string(k) + " does not fit the layer before it");
         layer.out = static_cast<int>(shape[0]);
         layer.in = static_cast<int>(shape[1]);
         made.push_back(std::move(layer));
@@ -164,11 +167,11 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
     return made;
 }
 
-// The field `name`, which must be a whole number in 1 .. most.
+// The value of the field `name`, which must be a whole number in 1 .. most.
 inline int small(const Json& entry, std::string_view name, int most) {
     const double n = entry.at(name, Json::Kind::Number).number;
     if (!(n >= 1 && n <= most) || n != std::floor(n))
-        throw Error("in its metadata, '" + std::string(name) + "' is not a whole number in 1 .. " +
+        throw Error("in the metadata, '" + std::string(name) + "' is not a whole number in 1 .. " +
                     std::to_string(most));
     return static_cast<int>(n);
 }
@@ -179,7 +182,8 @@ inline bool flag(const Json& entry, std::string_view name) {
     return found && found->kind == Json::Kind::Boolean && found->boolean;
 }
 
-// The fields `low` and `high`. They are finite: JSON has no infinity, and its reader refuses what no double can hold.
+// The values of the fields `low` and `high`. These values are finite, because JSON has no infinity, and `Json::parse`
+// rejects numbers that are too large for a double.
 inline std::pair<double, double> range(const Json& entry) {
     return {entry.at("low", Json::Kind::Number).number, entry.at("high", Json::Kind::Number).number};
 }
@@ -199,7 +203,7 @@ inline SourceParam source_param(const Json& entry) {
     return p;
 }
 
-// The field of the Principled BRDF with this name and size.
+// The field of `Principled` that has this name and this size.
 inline const Field& field(const std::string& name, int size) {
     for (const Field& f : FIELDS)
         if (f.name == name && f.size == size) return f;
@@ -224,8 +228,8 @@ inline TargetParam target_param(const Json& entry) {
     return p;
 }
 
-// The parameters of the material that the network was fitted to, from the record of the fit. Empty if the network reads
-// parameters, or if no material is recorded.
+// The parameters of the single material that the network was fitted to, from the file's record of its training. The
+// result is empty if the network reads parameters, or if the file has no record of a material.
 inline std::vector<float> material(const Json& about, const Weights& made) {
     std::size_t size = 0;
     for (const SourceParam& p : made.parameters) size += static_cast<std::size_t>(p.size);
@@ -237,7 +241,7 @@ inline std::vector<float> material(const Json& about, const Weights& made) {
         if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30)
             found.push_back(static_cast<float>(item.number));
     if (found.size() != size || fitted->items.size() != size)
-        throw Error("its material does not fit the class " + made.class_name + "; fit it again");
+        throw Error("its material does not fit the class " + made.class_name + "; fit the adapter again");
     return found;
 }
 
@@ -245,12 +249,12 @@ inline Weights weights(const char* bytes, std::size_t size) {
     std::uint64_t length = 0;
     if (size < 8) throw Error("too short for a weights file");
     for (int k = 7; k >= 0; --k) length = length << 8 | static_cast<unsigned char>(bytes[k]);
-    if (length > size - 8) throw Error("truncated, or not a safetensors file; copy or train it again");
+    if (length > size - 8) throw Error("truncated, or not a safetensors file; copy the file again or train again");
     const Json header = Json::parse({bytes + 8, static_cast<std::size_t>(length)});
     const Json& metadata = header.at("__metadata__", Json::Kind::Object);
     const Json about = Json::parse(metadata.at("nma", Json::Kind::String).string);
     if (about.at("format", Json::Kind::Number).number != FORMAT)
-        throw Error("it has a format that this version does not read; upgrade the runtime");
+        throw Error("the file has a format that this version does not read; upgrade the runtime");
     Weights made;
     made.class_name = about.at("class_name", Json::Kind::String).string;
     made.encoding = about.at("encoding", Json::Kind::String).string;
@@ -263,29 +267,29 @@ inline Weights weights(const char* bytes, std::size_t size) {
     made.material = material(about, made);
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
-    if (hidden.size() >= DEEPEST) throw Error("its network has too many layers");
+    if (hidden.size() >= DEEPEST) throw Error("the network has too many layers");
     const char* data = bytes + 8 + length;
     made.layers =
         layers(places(header, size - 8 - static_cast<std::size_t>(length)), data, static_cast<int>(hidden.size()) + 1);
     for (std::size_t k = 0; k < hidden.size(); ++k)
         if (static_cast<std::uint64_t>(made.layers[k].out) != hidden[k])
-            throw Error("its hidden layers do not have the widths in its metadata");
+            throw Error("the hidden layers do not have the widths in the metadata");
     return made;
 }
 
 }  // namespace detail
 
-// Reads the bytes of a weights file. Throws `Error`.
+// Parses the bytes of a weights file. Throws `Error` if they are not a valid weights file.
 inline Weights parse_weights(const void* bytes, std::size_t size) {
     return detail::weights(static_cast<const char*>(bytes), size);
 }
 
-// Returns the bytes of a file. Throws `Error`.
+// Returns the bytes of a file. Throws `Error` if it cannot be read.
 inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     std::string bytes;
-    // A folder can be opened but not read, and so can a file on a broken disk. `read` then reports a failure. Stream
-    // iterators would throw an exception that is no `Error`.
+    // A folder, or a file on a broken disk, can be opened but not read. For such a file, `read` reports a failure,
+    // whereas stream iterators would throw an exception that is not an `Error`.
     for (char block[1 << 14]; file.read(block, sizeof block), file.gcount() > 0;)
         bytes.append(block, static_cast<std::size_t>(file.gcount()));
     if (!file.eof()) throw Error("no such weights file, or it cannot be read");

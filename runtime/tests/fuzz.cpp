@@ -1,4 +1,5 @@
-// Loads bytes that claim to be a weights file: the outcome must be an adapter that works, or an error.
+// Tests that loading damaged or random bytes as a weights file either throws an `nma::Error` or returns an adapter that
+// works.
 //
 // Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER
 //                           -Iruntime runtime/tests/fuzz.cpp -o fuzz
@@ -22,7 +23,8 @@ void require(bool sound) {
     if (!sound) std::abort();
 }
 
-// Loads an adapter from these bytes and asks it for a BRDF. A refusal must be an `Error`. Returns whether it loaded.
+// Loads an adapter from `data`, and prepares and evaluates a BRDF. Returns false if loading throws an `nma::Error`. Any
+// other exception ends the program.
 bool attempt(const std::uint8_t* data, std::size_t size) {
     try {
         const nma::Adapter adapter = nma::Adapter::from_memory(data, size);
@@ -51,7 +53,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
 #else
 namespace {
 
-// Returns the file with one to four changes, most of them in its header.
+// Returns the bytes of a weights file with one to four random changes, most of them in the header.
 std::string changed(std::string bytes, std::mt19937& engine) {
     static constexpr const char* WORDS[] = {
         "null", "-1", "1e308", "[", "}", "\"", "\\u0000", "0", "4096", "true", "layer0.weight", "99999999999999999999"};

@@ -1,4 +1,5 @@
-// The common part of the programs in this folder: random numbers, materials and directions, and a check of values.
+// Code that the programs in this folder share: random numbers, random materials, random directions, and a check of
+// values.
 #pragma once
 
 #include <random>
@@ -7,7 +8,7 @@
 
 namespace nma::tests {
 
-// Uniform numbers in [0, 1). One of 256 is an end of the range: 0, or the largest float below 1.
+// Uniform numbers in [0, 1). One number of 256 is an end of this range: 0, or the largest float below 1.
 class Random {
 public:
     explicit Random(unsigned seed) : engine_(seed) {}
@@ -21,7 +22,8 @@ private:
     std::mt19937 engine_;
 };
 
-// Draws each number from its range: uniformly, or with a uniform logarithm if the parameter is logarithmic.
+// Draws each number of the parameters from its training range. The number is uniform, or has a uniform logarithm if the
+// parameter is logarithmic.
 inline void draw_parameters(const std::vector<SourceParam>& parameters, Random& random, float* to) {
     for (const SourceParam& p : parameters)
         for (int c = 0; c < p.size; ++c) {
@@ -30,7 +32,8 @@ inline void draw_parameters(const std::vector<SourceParam>& parameters, Random& 
         }
 }
 
-// Draws a direction, uniformly over the upper hemisphere. Two of 100 are the normal, eight are close to the horizon.
+// Draws a direction uniformly over the upper hemisphere. However, 2 % of the directions are the normal, and 8 % are
+// close to the horizon.
 inline Vec3<float> draw_direction(Random& random) {
     const float choice = random(), u = random(), phi = 6.2831853f * random();
     const float z = choice < 0.02f ? 1.0f : choice < 0.1f ? 1e-4f * u + 1e-6f : u;
@@ -38,7 +41,7 @@ inline Vec3<float> draw_direction(Random& random) {
     return {r * std::cos(phi), r * std::sin(phi), z};
 }
 
-// Whether a value and its density are finite and not negative.
+// Whether a value and a density are finite and not negative.
 inline bool sound(const Vec3<float>& v, float pdf) {
     for (const float x : {v.x, v.y, v.z, pdf})
         if (!is_finite(x) || x < 0.0f) return false;

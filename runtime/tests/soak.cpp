@@ -1,4 +1,5 @@
-// Millions of random materials and directions: nothing is NaN, infinite or negative, and samples agree with eval_pdf.
+// Tests millions of random materials and directions: values and densities must be finite and not negative, and the
+// results of `sample` must agree with those of `eval_pdf`.
 //
 //     c++ -std=c++17 -O2 -pthread -Iruntime runtime/tests/soak.cpp -o soak
 //     ./soak CALLS WEIGHTS        CALLS counts eval_pdf, pdf and sample together; threads share the adapter
@@ -22,7 +23,8 @@ constexpr float TOLERANCE = 1e-4f;
 
 bool close(float a, float b) { return std::abs(a - b) <= TOLERANCE * std::max(std::abs(a), std::abs(b)); }
 
-// Prepares a random material and makes CALLS_PER_ROUND calls. Returns the name of what is wrong, or null.
+// Prepares a random material and makes CALLS_PER_ROUND calls. Returns the name of the function whose result is wrong,
+// or null.
 const char* round_of_calls(const nma::Adapter& adapter, Random& random) {
     float parameters[64];
     nma::tests::draw_parameters(adapter.parameters(), random, parameters);

@@ -1,5 +1,5 @@
-// The simulated material, for random materials of its class and for the hardest ones: nothing is NaN, infinite or
-// negative.
+// Tests the simulated material with random parameters and with extreme parameters: values, densities and throughputs
+// must be finite and not negative.
 //
 //     c++ -std=c++17 -O2 -Iruntime runtime/tests/soak_layered.cpp -o soak_layered
 //     ./soak_layered CALLS        CALLS counts walk, evaluate, pdf, sample and albedo together
@@ -18,7 +18,7 @@ using nma::tests::sound;
 
 constexpr int CALLS_PER_ROUND = 8;
 
-// Hard materials: smooth and rough, thin and thick, index-matched, and without absorption.
+// Extreme materials: smooth and rough, thin and thick, index-matched, and without absorption.
 constexpr float HARD[][nma::layered3::COLUMNS] = {
     {1e-4f, 1e-4f, 1.0f, 0.24f, 0.96f, 1.18f, 3.9f, 2.6f, 2.4f, 0.9f, 0.5f, 0.1f, 1.0f},
     {1e-3f, 2e-3f, 1.5f, 0.24f, 0.96f, 1.18f, 3.9f, 2.6f, 2.4f, 0.8f, 0.8f, 0.8f, 0.3f},
@@ -27,7 +27,7 @@ constexpr float HARD[][nma::layered3::COLUMNS] = {
     {0.3f, 2e-3f, 1.05f, 1e4f, 0.0f, 1e4f, 0.0f, 1e4f, 1e4f, 0.0f, 0.5f, 1.0f, 4.0f},
 };
 
-// Makes CALLS_PER_ROUND calls for a material. Returns the name of what is wrong, or null.
+// Makes CALLS_PER_ROUND calls for a material. Returns the name of the function whose result is wrong, or null.
 const char* round_of_calls(const layered::Stack& stack, nma::tests::Random& random, layered::Random& walking) {
     const layered::Vec wi = draw_direction(random);
     const layered::Density density(stack, wi);

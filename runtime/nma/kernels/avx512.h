@@ -1,7 +1,7 @@
 // x86-64 with AVX-512 F, BW, DQ and VL: sixteen lanes, 32 registers.
 //
-// After the common kernels of body.inl come kernels for narrow networks, whose activations stay in registers. They read
-// `LayerView::turned`, which layout.h explains.
+// After the common functions of body.inl, this file has functions for narrow networks, whose activations stay in
+// registers. These functions read `LayerView::turned`, which layout.h explains.
 #pragma once
 
 #include <cstring>
@@ -19,7 +19,8 @@ constexpr int VEC_SIZE = 16, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 6;
 
 using Vec = __m512;
 
-// The mask of all lanes. Intrinsics without a mask make GCC 12 warn about its own headers (bug 105593).
+// The mask of all lanes. This file uses masked intrinsics, because intrinsics without a mask make GCC 12 warn about its
+// own headers (bug 105593).
 constexpr __mmask16 ALL = 0xffff;
 
 NMA_OP Vec load(const float* p) { return _mm512_load_ps(p); }
@@ -29,7 +30,8 @@ NMA_OP Vec add(Vec a, Vec b) { return _mm512_add_ps(a, b); }
 NMA_OP Vec sub(Vec a, Vec b) { return _mm512_sub_ps(a, b); }
 NMA_OP Vec mul(Vec a, Vec b) { return _mm512_mul_ps(a, b); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a, b, c); }
-// An estimate with 14 bits, whose digits one Newton step doubles. A division would take twice as long.
+// The instruction estimates 1 / a with 14 correct bits, and one Newton step doubles the count of correct bits. A
+// division would take twice as long.
 NMA_OP Vec inverse(Vec a) {
     const Vec near = _mm512_maskz_rcp14_ps(ALL, a);
     return fma(near, _mm512_fnmadd_ps(a, near, set(1.0f)), near);
@@ -46,8 +48,8 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
     return _mm512_castsi512_ps(_mm512_and_si512(raw(pairs), _mm512_set1_epi32(-65536)));
 }
 
-// Twin of `Indexed` in preparation.h, for at most 32 numbers: it picks them from two registers instead of memory. A
-// call returns `LANES` numbers, which are 4, and reads as many indices.
+// A version of `Indexed` (preparation.h) for at most 32 numbers, which are in two registers instead of memory. A call
+// reads `LANES` indices, which are 4, and returns the numbers with these indices.
 struct Few {
     static constexpr int MOST = 2 * VEC_SIZE;
     Vec low, high;
@@ -65,30 +67,30 @@ struct Few {
 
 #include "body.inl"
 
-// The kernels below see a vector as four blocks of four lanes each. `repeat` copies four numbers into all blocks: the
-// four at `p`, or block B of `v`.
+// The functions below treat a vector as four blocks of four lanes each. `repeat(p)` copies the four numbers at `p` into
+// all blocks, and `repeat<B>(v)` copies block B of `v` into all blocks.
 NMA_OP Vec repeat(const float* p) { return _mm512_maskz_broadcast_f32x4(ALL, _mm_loadu_ps(p)); }
 template <int B>
 NMA_OP Vec repeat(Vec v) {
     return _mm512_maskz_shuffle_f32x4(ALL, v, v, B * 0x55);
 }
-// Lane k of each block of four becomes lane (k + R) % 4.
+// Rotates the lanes of each block: lane k becomes lane (k + R) % 4.
 template <int R>
 NMA_OP Vec turn(Vec v) {
     return _mm512_maskz_permute_ps(ALL, v, R == 1 ? 0x93 : 0x4e);
 }
 
-// Adds four inputs to the sums of 16 neurons. `inputs` repeats the four inputs in all blocks. `columns` points to their
-// four columns of `LayerView::turned`. Sum r is still to be turned by r lanes.
+// Adds the contributions of four inputs to the sums of 16 neurons. `inputs` repeats the four inputs in all blocks.
+// `columns` points to the four columns of `LayerView::turned` for these inputs. `total` later rotates sum r by r lanes.
 NMA_OP void add_block(Vec (&sums)[4], Vec inputs, const float* columns) {
     NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * VEC_SIZE), sums[r]);
 }
-// The neurons: the sums, each turned by its own number of lanes, added up.
+// The values of 16 neurons: rotates sum r by r lanes, and adds up the four sums.
 NMA_OP Vec total(const Vec (&sums)[4]) {
     return add(add(sums[0], turn<1>(sums[1])), turn<2>(add(sums[2], turn<1>(sums[3]))));
 }
 
-// The first layer, whose inputs lie in memory. Its NARROW neurons fill the two vectors `y`.
+// Computes the first layer, whose inputs are in memory. The layer has NARROW neurons, which fill the two vectors `y`.
 NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
         const float* column = layer.turned + v * layer.in * VEC_SIZE;
@@ -97,7 +99,8 @@ NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
         y[v] = total(sums);
     }
 }
-// Any other layer. `y` holds the neurons of the layer before it, and then its own.
+// Computes a layer after the first. `y` holds the neurons of the layer before it on entry, and the neurons of this
+// layer on return.
 NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     const Vec a = max(y[0], set(0.0f)), b = max(y[1], set(0.0f));
     const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a),
@@ -109,13 +112,13 @@ NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     }
 }
 
-// All layers of a narrow network.
+// Computes all layers of a narrow network.
 NMA_OP void run_narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]) {
     first_layer(view.layers[0], inputs, y);
     for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
 }
 
-// `forward` for any network, in registers if it is narrow.
+// `forward` for any network. The activations of a narrow network stay in registers.
 NMA_FN inline void forward_either(const NetworkView& view, const float* inputs, float* outputs) {
     if (!view.narrow) return forward(view, inputs, outputs);
     Vec y[2];
@@ -138,7 +141,7 @@ NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, cons
     nma::set_lobe_probabilities(blend, wi.z, preparation.bounded);
 }
 
-// `prepare` for any network, in registers if it is narrow.
+// `prepare` for any network. The activations of a narrow network stay in registers.
 NMA_FN inline void prepare_either(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
                                   Blend<float>& blend) {
     if (preparation.network.narrow) return prepare_narrow(preparation, parameters, wi, blend);

@@ -1,7 +1,9 @@
-// x86-64 with AVX512-BF16. Its instruction multiplies two inputs by two weights at once and adds both products. Inputs
-// and activations are rounded to bfloat16, which keeps 8 significant bits; sums are float32. Layers must have `pairs`.
+// x86-64 with AVX512-BF16. In each lane, one instruction multiplies two inputs by two weights and adds the two products
+// to a sum. Inputs and activations are rounded to bfloat16, which keeps 8 significant bits. Sums are float32. Layers
+// must have `LayerView::pairs`.
 //
-// Only the network differs from avx512.h. `encode`, `decode` and `set_lobe_probabilities` are shared with it.
+// Only the code of the network differs from avx512.h, whose `encode`, `decode` and `set_lobe_probabilities` are used
+// here, too.
 #pragma once
 
 #include <cstring>
@@ -16,8 +18,8 @@ namespace nma::avx512_bf16 {
 using avx512::Vec;
 using avx512::VEC_SIZE;
 
-// Computes VECTORS vectors of neurons, the first of which is neuron `first`, for QUERIES queries. `x` holds the inputs
-// in pairs. Twin of `tile` in body.inl.
+// Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first neuron. `x` holds the
+// inputs in pairs. `tile` in body.inl is the version for float32.
 template <int VECTORS, int QUERIES, int SUMS>
 NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y,
                         int y_stride) {

@@ -1,6 +1,6 @@
-// The kernels in terms of a vector type. portable.h, neon.h, avx2.h and avx512.h each include this text inside their
-// own namespace, so it has no include guard and no namespace. It includes nothing. Before the
-// #include, a header defines these names:
+// The functions of `Kernels` (kernels.h), written with a vector type that each instruction set defines. portable.h,
+// neon.h, avx2.h and avx512.h include this file inside their own namespaces, so it has no include guard, no namespace
+// and no #include. Before the #include of this file, a header defines these names:
 //
 //     NMA_FN        macro: the attributes of a function for this instruction set
 //     NMA_OP        macro: the same attributes, and the function is always inlined
@@ -16,12 +16,12 @@
 //     BATCH_QUERIES queries that a tile of a batch has
 //     Few           picks numbers for lanes, from registers if possible: see `Indexed` in preparation.h
 //
-// `forward`, `forward_many`, `encode`, `decode`, `set_lobe_probabilities` and `prepare` are the kernels. `Kernels`
-// (kernels.h) points to them by the same names. All other functions here serve these six.
+// The members of `Kernels` point to the functions `forward`, `forward_many`, `encode`, `decode`,
+// `set_lobe_probabilities` and `prepare` below. The other functions in this file are helpers of these six.
 
-// Computes VECTORS vectors of neurons, the first of which is neuron `first`, for QUERIES queries. A neuron has SUMS
-// partial sums: in a single sum, each multiplication would wait for the one before it. PAIRS says whether the weights
-// are `pairs` rather than `columns`.
+// Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first neuron. Each neuron has
+// SUMS partial sums, because each addition to a single sum would wait for the addition before it. PAIRS says whether
+// the weights are `LayerView::pairs` instead of `LayerView::columns`.
 template <int VECTORS, int QUERIES, int SUMS, bool PAIRS>
 NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                         bool relu) {
@@ -69,7 +69,8 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
     }
 }
 
-// Computes all neurons of a layer from `first` on in tiles of VECTORS vectors. The rest takes tiles of half the size.
+// Computes all neurons of a layer from index `first` on, in tiles of VECTORS vectors. The neurons that remain are
+// computed in tiles of half the size.
 template <int VECTORS, int QUERIES, bool PAIRS>
 NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                          bool relu) {
@@ -110,8 +111,8 @@ NMA_FN inline void forward_many(const NetworkView& view, int queries, const floa
     for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
 }
 
-// 2^x for |x| <= 126, to two units in the last place: 2^n for the nearest whole number n, times a series in x - n,
-// which is at most 1/2.
+// 2^x for |x| <= 126, to two units in the last place. It is computed as 2^n times a power series in x - n, where n is
+// the whole number nearest to x, so |x - n| is at most 1/2.
 NMA_OP Vec exp2(Vec x) {
     const Vec n = nearest(x), r = sub(x, n), r2 = mul(r, r);
     const Vec low = fma(fma(r, set(0.0555041087f), set(0.240226507f)), r2, fma(r, set(0.693147181f), set(1.0f)));
@@ -120,8 +121,8 @@ NMA_OP Vec exp2(Vec x) {
     return scale(fma(high, mul(r2, r2), low), n);
 }
 
-// Decodes a vector of raw outputs, the first of which has index k. `Ranges` has the formula. `fade` is sin^2(theta_i).
-// Twin of nma/target/decode.py.
+// Decodes a vector of raw outputs by the formula at `Ranges` (layout.h). k is the index of the first of these outputs.
+// `fade` is sin^2(theta_i). nma/target/decode.py is the Python version of this function.
 NMA_OP Vec decoded(const Ranges& ranges, int k, Vec raw, float fade) {
     const Vec one = set(1.0f), faded = fma(load(ranges.in_plane + k), set(fade - 1.0f), one);
     const Vec x = max(min(mul(raw, set(-1.44269504f)), set(120.0f)), set(-120.0f));
@@ -137,7 +138,7 @@ NMA_FN NMA_WHOLE inline void encode(const Preparation& preparation, const float*
     preparation.encoding.encode(parameters, wi, inputs, preparation.network.layers[0].in);
 }
 
-// Decodes the raw outputs in place and fills in the blend, except for its lobe probabilities.
+// Decodes the raw outputs in place, and fills in the blend except for its lobe probabilities.
 NMA_FN NMA_WHOLE inline void decode(const Preparation& preparation, float* raw, float cosine, Blend<float>& blend) {
     for (int k = 0; k < preparation.ranges.count; k += VEC_SIZE)
         store(raw + k, decoded(preparation.ranges, k, load(raw + k), 1.0f - cosine * cosine));
@@ -149,7 +150,7 @@ NMA_FN NMA_WHOLE inline void set_lobe_probabilities(const Preparation& preparati
     nma::set_lobe_probabilities(blend, cosine, preparation.bounded);
 }
 
-// All steps for one query. FORWARD runs the network.
+// Runs all steps for one query. FORWARD is the function that runs the network.
 template <void (*FORWARD)(const NetworkView&, const float*, float*)>
 NMA_FN inline void prepare(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
                            Blend<float>& blend) {

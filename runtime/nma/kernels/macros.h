@@ -1,4 +1,5 @@
-// Attributes that compile a single function for an instruction set. The rest of the program does not need that set.
+// Attributes that compile a single function for an instruction set. The rest of the program is compiled without that
+// instruction set.
 #pragma once
 
 #if defined(__clang__)
@@ -12,7 +13,7 @@
 #if defined(__GNUC__)
 #define NMA_TARGET(features) __attribute__((target(features)))
 #define NMA_INLINE inline __attribute__((always_inline))
-// Inlines all that the function calls, so that the called code is compiled for the same instruction set.
+// Inlines all functions that the function calls, so that they are compiled for the same instruction set.
 #define NMA_WHOLE __attribute__((flatten))
 #else
 #define NMA_TARGET(features)

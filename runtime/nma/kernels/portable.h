@@ -1,4 +1,4 @@
-// Plain C++ with four lanes. Compilers turn it into vectors of their target.
+// Plain C++ with four lanes, which compilers translate to the vector instructions of the target CPU.
 #pragma once
 
 #include <cmath>
