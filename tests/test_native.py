@@ -63,7 +63,7 @@ def test_what_the_compiler_says_is_passed_on(tmp_path):
 
 
 @pytest.mark.slow
-def test_python_reaches_the_batched_kernel(tmp_path):
+def test_python_reaches_the_functions_for_batches(tmp_path):
     from nma.native.runtime import Runtime, available
 
     rng = np.random.default_rng(0)

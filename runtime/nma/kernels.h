@@ -93,9 +93,9 @@ inline InstructionSet fastest() {
     return InstructionSet::portable;
 }
 
-// The functions for one instruction set. The inputs of a query are a row of floats, filled with zeros up to the padded
-// input count of the first layer. The outputs of a query are a row whose length is the padded width of the last layer,
-// aligned to 64 bytes.
+// The kernels of one instruction set: the functions that are compiled for this set and called through a pointer. The
+// inputs of a query are a row of floats, filled with zeros up to the padded input count of the first layer. The outputs
+// of a query are a row whose length is the padded width of the last layer, aligned to 64 bytes.
 struct Kernels {
     InstructionSet set;
     // Runs the network for one query.
