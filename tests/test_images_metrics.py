@@ -37,7 +37,10 @@ def test_plain_errors_follow_their_formulas():
 
 
 def test_errors_grow_with_the_difference(picture):
-    """Every metric but SSIM is larger for the larger difference. SSIM ignores most of a change of brightness."""
+    """Every metric but SSIM is larger if a picture is brighter by 30 % than if it is brighter by 5 %.
+
+    SSIM ignores most of a change of brightness.
+    """
     small, large = (compare_images(picture * factor, picture) for factor in (1.05, 1.3))
     assert all(large[name] > small[name] > 0.0 for name in METRICS if name != "ssim")
 
@@ -101,7 +104,7 @@ def test_difference_pictures(picture):
     brighter = picture + 0.1
     none, signed = difference_image(picture, picture), difference_image(brighter, picture, kind="signed")
     assert none.shape == picture.shape and none.dtype == np.uint8
-    assert none.max() <= 4  # magma starts almost black
+    assert none.max() <= 4  # the darkest colour of the colour map `magma` is almost black
     assert (signed[..., 0] > signed[..., 2]).all()
     assert difference_image(brighter, picture, kind="absolute", scale=0.1).mean() > 150
     with pytest.raises(ImageError, match="unknown kind"):
@@ -109,7 +112,10 @@ def test_difference_pictures(picture):
 
 
 def test_tonemap_is_srgb():
-    """The tone curve gives known pairs of sRGB values. One stop of exposure doubles the input, and both ends clip."""
+    """The tone curve converts linear values to the known sRGB values, and clips values below 0 or above 1.
+
+    One stop of exposure doubles the linear values.
+    """
     linear = np.array([-1.0, 0.0, 0.001, 0.18, 0.5, 1.0, 9.0])
     expected = np.array([0.0, 0.0, 0.01292, 0.46135612, 0.73535698, 1.0, 1.0])
     np.testing.assert_allclose(tonemap(linear), expected, atol=1e-6)
@@ -134,7 +140,10 @@ def test_exr_keeps_values(tmp_path: Path, picture):
 
 
 def test_exr_files_are_written_and_read_with_one_thread(tmp_path: Path):
-    """A process with one thread writes and reads an EXR file. A hang means that OpenEXR waits for a second thread."""
+    """A process with one thread writes and reads an EXR file.
+
+    If this test does not end, OpenEXR waits for a second thread.
+    """
     program = (
         "import drjit, sys; drjit.set_thread_count(1)\n"
         "from nma.images.io import read_image, write_exr\n"

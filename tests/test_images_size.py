@@ -42,7 +42,7 @@ def bomb(path, kind):
 
 
 def _written(kind, width, height):
-    """Returns the bytes by which the header of this format states a size."""
+    """Returns the bytes that state the size of an image in the header of the file format `kind`."""
     match kind:
         case "png":
             ihdr = b"IHDR" + struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)

@@ -1,4 +1,7 @@
-"""Dr.Jit gets a libLLVM that is new enough, or an error of one line says what to do before the process is killed."""
+"""Dr.Jit gets a libLLVM that is new enough, or an error message of one line says what to do.
+
+Without the error message, Dr.Jit would kill the process.
+"""
 
 import os
 import re

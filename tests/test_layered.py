@@ -17,7 +17,10 @@ Float, PCG32 = dr.auto.Float, dr.auto.PCG32
 
 
 def layers_of(values, n):
-    """The stack in n lanes. Its parameters are opaque to the compiler, so that all materials share one kernel."""
+    """Returns the stack of a material in n lanes.
+
+    The parameters are opaque to the compiler, so that all materials share one kernel.
+    """
     columns = [dr.opaque(Float, float(c)) + dr.zeros(Float, n) for c in vector(values)]
     return layered_eval.settle(Layered3().gather(columns))
 
@@ -27,7 +30,7 @@ def direction(cos_theta):
 
 
 def random(n, seed):
-    """A random stream with an opaque seed, so that all seeds share one kernel."""
+    """Returns a random stream. Its seed is opaque to the compiler, so that all seeds share one kernel."""
     return PCG32(n, dr.opaque(dr.auto.UInt64, seed))
 
 
@@ -50,7 +53,7 @@ def estimates(layers, wi, rng):
 
 
 def evaluated_table(values, per_row, seed):
-    """The bin means (theta_i, theta_o, phi, 3) from evaluation, and their standard errors."""
+    """Returns the means of bins (theta_i, theta_o, phi, 3) from evaluation, and their standard errors."""
     row = dr.arange(dr.auto.UInt32, GRID.theta_i * per_row) // per_row
     rng = random(dr.width(row), seed)
     layers = layers_of(values, dr.width(row))
@@ -69,9 +72,9 @@ def evaluated_table(values, per_row, seed):
 
 
 def compare(values, seed, factor=1.0):
-    """The z-scores of the difference between evaluation (times `factor`) and walks.
+    """Returns the z-scores of the difference between evaluation (times `factor`) and walks.
 
-    There is one for each bin with over 100 walks, and one for the sum of each row.
+    There is a score for each bin with over 100 walks, and for the sum of each row.
     """
     walks = tabulate(Layered3(), vector(values)[None], 1 << 20, stream_keys(seed, range(1)), grid=GRID)
     return z_scores(*evaluated_table(values, 1 << 17, seed), walks, factor)
@@ -101,7 +104,7 @@ def test_comparison_would_see_two_percent():
 def test_integral_of_rough_coat_over_white_conductor():
     """The albedo at cos(theta_i) = .9 is .556, to three digits.
 
-    In this case, evaluation and walks of two public programs disagree.
+    In two public programs, evaluation and random walks give different albedos for this material.
     """
     n = 1 << 20
     _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), random(n, 5))
@@ -128,7 +131,7 @@ def test_finite_everywhere():
     n, rng = 1 << 15, np.random.default_rng(2)
 
     def spread(low, high, log=False):
-        """Random values in a range. A third of them are at its ends."""
+        """Returns random values in a range. A third of the values are at the ends of the range."""
         u = np.clip(rng.uniform(-0.25, 1.25, n), 0.0, 1.0)
         return Float((low * (high / low) ** u if log else low + u * (high - low)).astype(np.float32))
 
@@ -149,7 +152,10 @@ def test_finite_everywhere():
 
 @pytest.mark.parametrize("case", CASES)
 def test_density_follows_the_walk(case):
-    """The density is positive where walks leave, and estimates with directions drawn from it have a low variance."""
+    """The density is positive for every direction in which a walk leaves the material.
+
+    Estimates with directions drawn from the density have a low variance.
+    """
     n = 1 << 16
     layers = layers_of(CASES[case], n)
     for mu in (1.0, 0.6, 0.05):

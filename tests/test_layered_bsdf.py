@@ -73,7 +73,7 @@ def test_the_methods_of_the_bsdf_agree():
     assert dr.all(~left | (dr.abs(bsdf.pdf(ctx, si, bs.wo) - bs.pdf) <= 1e-5 * bs.pdf))
     assert dr.all(left | dr.all(weight == 0))
     assert dr.all(~left | ((bs.wo.z > 0) & (bs.eta == 1) & (dr.abs(dr.norm(bs.wo) - 1) < 1e-4)))
-    # All methods draw the same estimate from the same arguments.
+    # Values are random estimates, but all methods compute the same estimate from the same arguments.
     for a, b in ((bsdf.eval(ctx, si, wo), value), (joint_value, value), (joint_weight, weight2)):
         np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-4, atol=1e-6)
     for a, b in ((bsdf.pdf(ctx, si, wo), pdf), (joint_pdf, pdf), (joint_bs.pdf, bs2.pdf)):
@@ -86,7 +86,7 @@ def test_evaluation_and_sampling_have_the_same_albedo():
     for cos_theta in (0.95, 0.4):
         si, rng = interactions(n, 1, cos_theta)
         _, weight = samples(bsdf, si, rng)
-        # These directions follow a cosine density, which is unrelated to the BSDF.
+        # The directions `wo` follow a cosine density, which is unrelated to the BSDF.
         wo = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
         value = bsdf.eval(ctx, si, wo) * (dr.pi / wo.z)
         a, b = np.array(weight, np.float64), np.array(value, np.float64)
@@ -234,9 +234,10 @@ def register_bsdf_sampling():
 
 
 def same_image(a, b):
-    """Tests whether two measurements have equal means, and returns the verdict and the worst deviations.
+    """Returns whether two measured images have equal means, and the worst deviations.
 
-    There are three tests, with a false-alarm rate of 1 % each: per pixel, in blocks of 8 x 8, and over the whole image.
+    Three tests compare the means of pixels, of blocks of 8 x 8 pixels, and of the whole image. The false-alarm rate of
+    each test is 1 %.
     """
     tests = {
         n: zscore_images(a.mean, a.variance, 8, b.mean, b.variance, 8, block=n, rounding=1e-4)
@@ -282,13 +283,14 @@ def test_white_furnace():
     }
     result = measure(mi.load_dict(description), 1024, 6, warmup=False)
     one = np.ones_like(result.mean)
-    # Even at this small roughness, facets mask about .1 % of the light, at grazing angles below the coat.
+    # Even at this small roughness, microfacets block about .1 % of the light at grazing angles below the coat. So the
+    # test allows a difference of 1e-3.
     same = zscore_images(result.mean, result.variance, 6, one, 0 * one, 1, rounding=1e-3, false_alarm=1e-3)
     assert same.passed, f"p {same.p_values.min():.1e} below {same.level:.1e} at {same.worst}"
 
 
 def test_a_scene_s_composites_do_not_depend_on_the_scenes_loaded_before():
-    """`blended` is right about a BSDF even if a BSDF of an older scene had the same name and address."""
+    """`blended` returns the right result for a BSDF even if a BSDF of an older scene had the same name and address."""
     blend = {"type": "blendbsdf", "weight": 0.5, "a": LACQUER, "b": {"type": "diffuse"}}
     kept = []
     for composite in (True, False, True, True, False, False):

@@ -38,12 +38,15 @@ TINY = replace(
     steps=250,
 )
 CODING = replace(TINY, steps=150, learning_rate=5e-2)
-# Training must reach this log loss within 250 steps. The initial log loss is above .02.
+# The log loss that training must reach within 250 steps, from an initial log loss above .02.
 REACHED = 0.003
 
 
 def matte(rho):
-    """Returns noise-free tables of Lambertian materials with albedos `rho` (n, 3). The only parameter is the index."""
+    """Returns noise-free tables of Lambertian materials with albedos `rho` (n, 3).
+
+    The only parameter of a material is its index in `rho`.
+    """
     cosines = (np.arange(40) + 0.5) / 40
     values = rho[:, None, None, None, :] / math.pi * cosines[None, None, :, None, None]
     values = np.broadcast_to(values, (len(rho), *ISOTROPIC.shape)).astype(np.float32)
@@ -144,7 +147,7 @@ def test_encoding_a_new_material_beats_the_nearest_code(library, tables):
     for (matrix, bias), (before, bias_before) in zip(library.adapter.layers, layers, strict=True):
         np.testing.assert_array_equal(matrix, before)
         np.testing.assert_array_equal(bias, bias_before)
-    # Each material of the library is nearest to its own code.
+    # Among the codes of the library, the code of a material fits its table best.
     nearest = [
         np.argmin(training._judge(library.codes, library, tables[k : k + 1], CODING)) for k in range(3)
     ]

@@ -121,20 +121,21 @@ def mean(integrator, spp, runs=8):
 def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
     """The mean colours of both integrators agree within 4.5 standard errors.
 
-    The errors have seven degrees of freedom, which makes a false alarm in about a hundred runs; seeds are fixed.
+    With errors of seven degrees of freedom, about one run in a hundred would be a false alarm; seeds are fixed.
     """
     wanted, doubt = mean("path", 1024)
     found, error = mean("ptracer", 16384)
     assert (error < 0.01 * wanted).all()
     assert (np.abs(found - wanted) < 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
-    # If the parameters are prepared for the direction of the light instead, the test detects the difference.
+    # The test detects the difference if the adapter is prepared for the direction of the light, not of the view.
     monkeypatch.setattr(Adapter, "reciprocal", True)
     found, error = mean("ptracer", 16384)
     assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
 
 
-# Prints five colours for each random pair of directions. Three are values of f: for a camera path, for a light path,
-# and for a camera path with swapped directions. Two belong to a sample: weight times pdf, and the value of `eval_pdf`.
+# A program that prints five colours for each random pair of directions. The first three colours are values of f: for a
+# camera path, for a light path, and for a camera path with swapped directions. The last two colours belong to a sample:
+# its weight times its pdf, and the value that `eval_pdf` returns for its direction.
 SCALAR = """
     rng = np.random.default_rng(0)
     light = mi.BSDFContext(mi.TransportMode.Importance)

@@ -61,7 +61,7 @@ def test_the_studio_leaves_weaker_fireflies_than_outdoors():
 
 
 def test_outdoors_is_the_lighting_of_the_committed_results():
-    """The mean colour of a picture stays as it was when the results of benches and figures were committed.
+    """The mean colour of a picture is the same as when the results of benches and figures were committed.
 
     A failure means that the lighting has changed, so that new results cannot be compared with the committed ones.
     """
@@ -84,9 +84,10 @@ def test_unknown_lightings_and_a_missing_sun_are_refused():
 
 @pytest.mark.parametrize(("spp", "pixels"), [(128, 512 * 512), (64, 256 * 256), (100, 192 * 192), (7, 64)])
 def test_multijittered_samples_fill_a_grid(spp, pixels, capfd):
-    """`sampler` chooses multijitter only for sample counts that Mitsuba takes as they are.
+    """`sampler` chooses the sampler `multijitter` only for sample counts that Mitsuba does not change.
 
-    Mitsuba rounds other counts up, and warns. A failure means that a picture has more samples than the user asked for.
+    Mitsuba rounds all other sample counts up, and prints a warning. A failure means that a picture has more samples
+    than the user asked for.
     """
     kind = sampler(spp, pixels)
     for samples in pass_sizes(spp, pixels):
@@ -96,7 +97,10 @@ def test_multijittered_samples_fill_a_grid(spp, pixels, capfd):
 
 
 def test_the_command_asks_for_no_sample_count_that_mitsuba_warns_of(capfd):
-    """Mitsuba would warn of 128 samples, which fill no grid. Two passes of 64 samples fill grids without a warning."""
+    """A picture of 128 samples per pixel is rendered in two passes of 64 samples, which fill a grid.
+
+    Mitsuba would print a warning for a pass of 128 samples, because they do not fill a grid.
+    """
     view = View((192, 192), 128, 6, "hero", "studio", None, "llvm_ad_rgb")
     assert sampler(128, 192 * 192) == "multijitter"
     view.load(load_material("wet-nickel"), "layered")

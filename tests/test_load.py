@@ -111,7 +111,7 @@ def test_a_material_becomes_a_dictionary_for_either_bsdf():
 def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
     """With `uv_scale = 3` an image repeats three times along u.
 
-    The material is named by its file in a scene, or given as a dictionary.
+    The scene gives the material by the name of its file, or as a dictionary.
     """
     pixels = np.zeros((1, 8, 3), np.uint8)
     pixels[:, 2:4, 0] = 255

@@ -1,4 +1,4 @@
-"""The loss of training: means over bins, the minima of its distances, and its albedos.
+"""The loss of training: means over bins, the minima of the log loss and of the Huber loss, and estimates of albedos.
 
 Each statistical test has the false-alarm rate `FALSE_ALARM`; seeds are fixed. The tests share few recipes, because JAX
 compiles each recipe anew.
@@ -48,8 +48,8 @@ def tables():
 def test_bin_means_in_jax_equal_the_tables_of_the_evaluation(tables, law, kind):
     """Training in JAX and evaluation in Dr.Jit average the same target to the same means over bins.
 
-    The two use different code and different points. A failure means that training fits other values than the
-    evaluation judges.
+    Training and evaluation use different code and different points. A failure means that training fits other values
+    than the evaluation judges.
     """
     params, stretched = target.TARGETS[kind], kind == "stretched"
     across = BRASS.instances[0]._replace(anisotropic=-3.0 if stretched else 0.0)
@@ -82,9 +82,10 @@ def test_the_points_law_centre_evaluates_the_middle_of_the_bin(tables):
 
 
 def compound_poisson(rng, mean, quantum, shape):
-    """Draws the values of bins with few walks: a Poisson count of walks, each of a throughput from 0 to 1.
+    """Draws random values of bins with few walks, whose expected value is `mean`.
 
-    The values have the given mean. `quantum` is the value of one walk of throughput 1.
+    The count of walks in a bin has a Poisson distribution, and each walk has a throughput from 0 to 1. `quantum` is the
+    value of one walk of throughput 1.
     """
     counts = rng.poisson(2.0 * mean / quantum, shape)
     total = np.zeros(shape)
@@ -95,9 +96,10 @@ def compound_poisson(rng, mean, quantum, shape):
 
 @pytest.mark.slow
 def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at_their_median():
-    """The brightness that minimises the log loss is the median of sparse bins, which is too dark.
+    """In bins with few walks, the log loss is least at the median, which is darker than the mean.
 
-    The Huber loss has less than 30 % of this bias. The target is matte, and only its brightness is fitted.
+    The bias of the Huber loss is less than 30 % of the bias of the log loss. The target is matte, and only its
+    brightness is fitted.
     """
     rng, quantum = np.random.default_rng(6), 0.2
     base = replace(
@@ -134,7 +136,7 @@ def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at
     batch = batch._replace(value=np.broadcast_to(values, (3, 1, 4000)).astype(np.float32))
 
     def best(kind):
-        """Returns the brightness that minimises the loss, relative to the true one."""
+        """Returns the brightness that minimises the loss, relative to the exact brightness."""
         recipe, scales = replace(base, loss=kind), np.linspace(0.05, 1.5, 59)
         lit = [raw.copy() for _ in scales]
         for row, scale in zip(lit, scales, strict=True):
@@ -164,8 +166,9 @@ def exact_albedo(raw, mu):
 def test_albedos_and_their_derivatives_are_unbiased(tables):
     """Estimates of albedos and their derivatives have the means that quadrature gives (t-tests).
 
-    The product of the two independent halves has the squared albedo as its mean. The false-alarm rate is `FALSE_ALARM`
-    over all comparisons. A failure means that training pulls albedos away from those of the tables.
+    An estimate consists of two independent halves, and the mean of their product is the squared albedo. The false-alarm
+    rate is `FALSE_ALARM` over all comparisons. A failure means that training pulls albedos away from those of the
+    tables.
     """
     blocks, rows = 40, 32
     recipe = replace(TINY, encoding="direction", directional=False, rows=rows, albedo_samples=8)
@@ -201,6 +204,6 @@ def test_albedos_and_their_derivatives_are_unbiased(tables):
 def assert_mean(values, expected, comparisons):
     """Asserts the mean of independent values by a t-test. All comparisons share the rate `FALSE_ALARM`."""
     spread = values.std(ddof=1) / math.sqrt(len(values))
-    # The 1e-5 below allows for single precision.
+    # The summand 1e-5 allows for rounding in single precision.
     limit = student.isf(0.5 * FALSE_ALARM / comparisons, len(values) - 1)
     assert abs(values.mean() - expected) < limit * spread + 1e-5

@@ -19,7 +19,7 @@ def test_colours_are_made_linear_and_numbers_are_not(material_file, tmp_path):
         "albedo"
     ]
     assert colour.read().shape == (2, 4, 3)
-    np.testing.assert_allclose(colour.read(), 0.21586, atol=1e-4)  # sRGB 128 in linear light
+    np.testing.assert_allclose(colour.read(), 0.21586, atol=1e-4)  # the sRGB byte 128 in linear light
 
     texture = "{ texture = 'image.png', scale = 0.5, offset = 0.1 }"
     number = materials.load(material_file("sigma_t = 0.25", f"sigma_t = {texture}")).values["sigma_t"]
@@ -64,7 +64,10 @@ def test_only_the_chosen_channel_must_lie_in_the_range(material_file, tmp_path):
 
 
 def test_a_coloured_image_for_one_number_is_refused_unless_a_channel_is_chosen(material_file, tmp_path):
-    """The message says how to choose a channel. A grey image of three equal channels needs no choice."""
+    """The error message says how to choose a channel of the coloured image.
+
+    A grey image with three equal channels is accepted without a choice.
+    """
     write_image(tmp_path / "orm.png", PACKED[..., :3].copy())
     texture = materials.load(material_file("sigma_t = 0.25", "sigma_t = { texture = 'orm.png' }")).values[
         "sigma_t"
@@ -123,7 +126,7 @@ def test_an_image_without_colour_channels_is_refused_with_the_names_of_its_chann
 
 
 def test_images_repeat_as_often_as_the_file_says(material_file, tmp_path):
-    """The `uv_scale` of a material holds for all of its textures that have none of their own, also for added ones."""
+    """The `uv_scale` of a material applies to every texture without its own `uv_scale`, even if it is added later."""
     write_image(tmp_path / "image.png", PACKED)
     both = "alpha_bottom = { texture = 'image.png', channel = 'g', uv_scale = 2.5 }\nalbedo = { texture = 'image.png' }"
     path = material_file("alpha_bottom = 0.2", both)

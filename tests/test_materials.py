@@ -78,7 +78,10 @@ def test_a_medium_through_which_walks_would_not_end_is_refused(material_file, gi
 
 
 def test_a_metal_whose_reflectance_overflows_is_refused(material_file):
-    """An index of 1e4 is allowed and reflects all light. In single precision an index of 1e10 would look black."""
+    """A conductor with an index of refraction of 1e4 is allowed and reflects all light.
+
+    An index of 1e10 is refused, because the conductor would look black in single precision.
+    """
     with pytest.raises(MaterialError, match=r"k_conductor is .* allowed is 0 \.\. 10000"):
         materials.load(material_file('conductor = "Au"', "eta_conductor = 1\nk_conductor = 1e10"))
     largest = materials.load(material_file('conductor = "Au"', "eta_conductor = 1e4\nk_conductor = 1e4"))
@@ -155,7 +158,8 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_fault(material_file, old
     assert len(str(error.value)) < 1000 and "\n" not in str(error.value)
 
 
-# Values, keys and fragments of text that the next test writes into a good file, in place of its keys and values.
+# Values, keys and text fragments that make a material file faulty. The test of faulty files writes them in place of
+# correct keys and values.
 NASTY = (
     "0.5",
     "1",
@@ -285,6 +289,9 @@ def test_a_vector_becomes_a_material_and_back():
 
 @pytest.mark.parametrize("name", materials.names())
 def test_descriptions_promise_no_effect_that_the_class_lacks(name):
-    """No description names brushing, flakes or similar effects, because the layers are isotropic and homogeneous."""
+    """No description of a material mentions effects such as brushing or flakes.
+
+    The model cannot show such effects, because its layers are isotropic and homogeneous.
+    """
     text = materials.load(name).description.lower()
     assert not [word for word in ("brush", "flake", "spark", "scratch", "grain", "fibre") if word in text]

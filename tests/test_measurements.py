@@ -76,13 +76,13 @@ def test_faults_are_named_file_by_file(data, uniform, measurements):
     (folder / "paper_white_rgb.bsdf").write_bytes(paper[:-1])
     (folder / "sub").mkdir()
     shutil.copy(measurements / "rgl" / "cg_sunflower_rgb.bsdf", folder / "sub" / "mine_rgb.bsdf")
-    # A sound file of the right size, but not the original one.
+    # A readable file of the right size that differs from the original file in one bit.
     changed = bytearray(paper)
     changed[200_000] ^= 1
     (folder / "sub" / "paper_white_rgb.bsdf").write_bytes(changed)
     (folder / "merl_nbrdf_weights.npz").write_bytes(b"damaged")
     np.savez(folder / "networks.npz", names=np.array(["a"]), weights=np.zeros((1, 3)))
-    # Files of other kinds are ignored.
+    # `nma data check` ignores files of other kinds.
     np.savez(folder / "reference.npz", table=np.zeros(3))
     (folder / "notes.txt").write_text("nothing")
     code, out, err = data("check", folder)

@@ -22,14 +22,17 @@ from nma.table import Tables
 
 
 def at(h, d, p):
-    """The directions (light, view) at a position that is given in cells."""
+    """Returns the directions (light, view) at a position in the grid of a MERL file.
+
+    `h`, `d` and `p` are the indices of theta_h, theta_d and phi_d, and may have fractions.
+    """
     theta_h, theta_d = (np.asarray(h) / 90) ** 2 * math.pi / 2, np.asarray(d) / 90 * math.pi / 2
     light, view = half_difference.directions(theta_h, theta_d, np.asarray(p) / 180 * math.pi)
     return light, view
 
 
 def f_of(source, light, view):
-    """f (n, 3) of a source, for directions in NumPy."""
+    """Returns f (n, 3) of a source, for directions as NumPy arrays."""
     light, view = Vec3(*lanes(*light)), Vec3(*lanes(*view))
     return numbers(source.eval(view, light)) / light.z.numpy()[:, None]
 
@@ -44,7 +47,7 @@ def planes():
 
 
 def inner_cells(n=2000, seed=1):
-    """Cells in whose middle both directions are above the horizon."""
+    """Returns random cells. In the middle of each cell, both directions are above the horizon."""
     rng = np.random.default_rng(seed)
     h, d, p = rng.integers(0, 60, n), rng.integers(0, 40, n), rng.integers(0, 180, n)
     light, view = at(h + 0.5, d + 0.5, p + 0.5)
@@ -90,7 +93,10 @@ def test_a_file_of_full_size_comes_back(planes, tmp_path):
 
 
 def test_the_layout_is_merls(planes, tmp_path):
-    """The file has three dimensions, then the entries. phi_d varies fastest, then theta_d, theta_h and the channel."""
+    """A MERL file begins with the three dimensions of the grid, and all entries follow.
+
+    From one entry to the next, the index of phi_d varies fastest, then theta_d, then theta_h, and the channel last.
+    """
     path = tmp_path / "random.binary"
     Merl(planes).save(path)
     content = path.read_bytes()
@@ -103,17 +109,17 @@ def test_the_layout_is_merls(planes, tmp_path):
 def test_an_entry_is_the_value_in_the_middle_of_its_cell(planes):
     """In the middle of a cell, f is the cell's entry times the scale.
 
-    The database's own reader, which rounds angles down to an entry, returns the same.
+    The database's own reader returns the same f, although it does not interpolate but rounds angles down to an entry.
     """
     h, d, p = inner_cells()
     expected = (planes[:, h, d, p] * SCALE[:, None]).T
     measured = expected[:, 0] > 0
     source = Merl(planes)
     light, view = at(h + 0.5, d + 0.5, p + 0.5)
-    # Swapped directions have the same entry, as the format is reciprocal.
+    # If light and view are swapped, f comes from the same entry, because the format is reciprocal.
     for found in (f_of(source, light, view), f_of(source, view, light)):
         error = np.abs(found[measured] / expected[measured] - 1.0)
-        # Near the normal, cells are small, so single precision is too coarse for half vectors there.
+        # The largest error is near the normal, where cells are too small for half vectors in single precision.
         assert np.median(error) < 1e-4
         assert error.max() < 0.05
 
@@ -129,7 +135,7 @@ def test_values_between_are_linear_in_each_coordinate():
 
 
 def test_the_azimuth_goes_round():
-    """Between the last and the first entry of phi_d, which differ, values are interpolated."""
+    """Values between the last and the first entry of phi_d are interpolated, because phi_d is periodic."""
     plane = np.zeros(SHAPE)
     plane[..., 0], plane[..., -1] = 3.0, 1.0
     found = f_of(
@@ -139,7 +145,10 @@ def test_the_azimuth_goes_round():
 
 
 def test_what_was_not_measured_is_left_out():
-    """A uniform material with missing entries stays uniform. The material is black where all neighbours are missing."""
+    """A uniform material with missing entries stays uniform.
+
+    The material is black at directions whose neighbouring entries are all missing.
+    """
     rng = np.random.default_rng(5)
     uniform = np.where(rng.random(SHAPE) < 0.3, -0.5, 1500.0)
     uniform[40:] = -1.0
@@ -192,7 +201,7 @@ def test_an_anisotropic_source_is_refused():
 
 
 def spoilt(value, where=slice(5, 6)):
-    """The content of a file in which some entries are replaced by `value`."""
+    """Returns the bytes of a MERL file in which some entries are replaced by `value`."""
     entries = np.ones(3 * math.prod(SHAPE))
     entries[where] = value
     return struct.pack("<3i", *SHAPE) + entries.tobytes()

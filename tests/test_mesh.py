@@ -1,4 +1,4 @@
-"""Meshes in place of the shader ball: their place and size, what is kept of the file, and which files are refused."""
+"""Meshes in place of the shader ball: their position and size, their normals and texture coordinates, faulty files."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from nma.render.textures import bitmap_texture
 nma.render.use("llvm_ad_rgb")
 import mitsuba as mi  # noqa: E402
 
-# A wedge far from the origin. Its height (y) is twice its width (x).
+# A wedge far from the origin, whose height (y) is twice its width (x).
 OBJ = """
 v 10 0 5\nv 12 0 5\nv 12 0 6\nv 10 4 5
 vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1

@@ -24,9 +24,10 @@ def square(n):
 
 
 def normals(alpha_x, alpha_y, n=400):
-    """Normals and weights such that weighted means are integrals against D cos(theta). The long tail has many normals.
+    """Returns normals and their weights. The weighted mean of a function is its integral against D cos(theta).
 
-    Slopes follow P(|slope / alpha| > t) = 1 / (1 + t^2), which is (1 - v)^4 here.
+    The slopes of GGX normals follow P(|slope / alpha| > t) = 1 / (1 + t^2). To place many normals in the long tail, the
+    code sets this probability to (1 - v)^4 for uniform numbers v.
     """
     v, u2 = square(n)
     t = np.sqrt(1 - (1 - v) ** 4) / (1 - v) ** 2
@@ -48,7 +49,7 @@ ALPHAS = pytest.mark.parametrize("alphas", ((0.001, 0.001), (0.05, 0.3), (0.4, 0
 @ALPHAS
 def test_distribution_is_the_density_of_its_slopes(alphas):
     m, _ = normals(*alphas)
-    # In slopes p = -m.xy / m.z, D cos^4 is a known density. Heitz 2014, eq. 75 and 84.
+    # The density of the slopes -m.xy / m.z is D cos^4(theta), and has a known formula (Heitz 2014, eq. 75 and 84).
     sx, sy = m.x / m.z / alphas[0], m.y / m.z / alphas[1]
     expected = 1 / (np.pi * alphas[0] * alphas[1] * (1 + sx * sx + sy * sy) ** 2)
     np.testing.assert_allclose(ggx_d(m, *alphas) * m.z**4, expected, rtol=1e-9)
@@ -57,7 +58,8 @@ def test_distribution_is_the_density_of_its_slopes(alphas):
 @ALPHAS
 @pytest.mark.parametrize("cos", (0.1, 0.5, 0.95))
 def test_visible_area_projects_to_the_macrosurface(alphas, cos):
-    # Smith masking is derived from the condition int D(m) G1 <w.m> dm = cos(theta). Heitz 2014, eq. 43.
+    # Smith's masking function G1 is derived from a condition: the visible microfacets project to the area cos(theta) of
+    # the macrosurface. So the integral of D(m) G1 max(dot(w, m), 0) over m is cos(theta) (Heitz 2014, eq. 43).
     m, weight = normals(*alphas)
     w = direction(cos, 0.7)
     g1 = smith_g1(w, *alphas)
@@ -68,7 +70,7 @@ def test_visible_area_projects_to_the_macrosurface(alphas, cos):
 @ALPHAS
 @pytest.mark.parametrize("cos", (0.05, 0.5, 0.95))
 def test_visible_normals_follow_their_density(alphas, cos):
-    # For any function of the normal, the mean over samples is the integral against the density.
+    # For any function of the normal, the mean over samples is the integral of the function times the density.
     w = direction(cos, 0.7)
     m = sample_visible_normal(w, *alphas, *square(600))
     assert np.all(ops.dot(w, m) > -1e-12)
@@ -98,7 +100,7 @@ def test_dielectric_reflectance_in_closed_form():
     s_only = 0.5 * np.sin(2 * brewster - np.pi / 2) ** 2
     assert fresnel_dielectric(np.cos(brewster), 1.5)[0] == pytest.approx(s_only)
     assert fresnel_dielectric(0.0, 1.5)[0] == pytest.approx(1.0)
-    # On the denser side, beyond the critical angle, all light is reflected.
+    # Inside the denser medium, light beyond the critical angle is reflected completely.
     assert fresnel_dielectric(0.5, 1 / 1.5) == (1.0, 0.0)
 
 

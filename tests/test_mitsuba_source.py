@@ -71,7 +71,7 @@ def test_a_diffuse_bsdf_from_a_dictionary_a_file_and_a_fragment(tmp_path):
 
 @pytest.mark.parametrize("alphas", ((0.01, 0.01), (0.2, 0.2), (0.1, 0.4)))
 def test_a_rough_mirror_has_the_value_of_its_formula(alphas):
-    """Walter 2007, eq. 20, with Fresnel term 1."""
+    """The value of a rough mirror is that of Walter 2007, eq. 20, with a Fresnel term of 1."""
     source = from_dict(MIRROR | {"alpha_u": alphas[0], "alpha_v": alphas[1]})
     wi, wo = pairs(2000, low=0.05)
     m = ops.normalize(wi + wo)
@@ -121,7 +121,7 @@ def test_textures_are_looked_up_where_asked():
 
 
 def test_lanes_keep_their_type():
-    """Values have the array type of the directions: Dr.Jit's own, or Mitsuba's with derivatives."""
+    """Values have the same array type as the directions: Dr.Jit's type, or Mitsuba's type with derivatives."""
     wi, wo = pairs(10)
     source = from_dict(DIFFUSE)
     there = source.eval(Vec3(*map(mi.Float, wi)), Vec3(*map(mi.Float, wo)))
@@ -171,10 +171,10 @@ def test_variants_that_cannot_serve_are_refused():
 
 
 def nodes(fields, k=0):
-    """(wi, wo, f cos) at the nodes of a material's grid, for its k-th azimuth of incidence.
+    """Returns (wi, wo, f cos(theta_o)) at the nodes of a material's grid, for the azimuth of incidence of index k.
 
     The nodes are the points of the grid, warped by the distribution of visible normals. The value at a node is the
-    grid's entry times the distribution of normals divided by the projected area. Dupuy and Jakob 2018, section 4.
+    grid's entry, times the distribution of normals, divided by the projected area (Dupuy and Jakob 2018, section 4).
     """
     phi, theta, size = float(fields["phi_i"][k]), fields["theta_i"], fields["rgb"].shape[-1]
     inner = np.arange(1, size - 1)
@@ -211,7 +211,7 @@ def test_a_measured_material_has_the_values_of_its_file(measurements, material):
 
 
 def test_a_material_with_azimuths_of_incidence_is_anisotropic(bsdf_file, tmp_path):
-    """The material is an isotropic one whose brightness is changed to depend on the azimuth."""
+    """The test makes an anisotropic material from an isotropic one: its brightness varies with the azimuth."""
     fields, azimuths = rgl.read(bsdf_file), np.linspace(-math.pi, math.pi, 5).astype(np.float32)
     tiled = {name: np.repeat(fields[name], 5, axis=0) for name in ("vndf", "luminance", "rgb")}
     tiled["rgb"] = tiled["rgb"] * np.array([1, 2, 3, 4, 1], np.float32)[:, None, None, None, None]
@@ -224,7 +224,7 @@ def test_a_material_with_azimuths_of_incidence_is_anisotropic(bsdf_file, tmp_pat
 
 
 def changed(fields, **others):
-    """The fields, with those in `others` replaced. A field that is None in `others` is left out."""
+    """Returns `fields` with the fields of `others` in their place. A field that is None in `others` is left out."""
     return {name: array for name, array in (fields | others).items() if array is not None}
 
 
@@ -274,7 +274,7 @@ def test_a_missing_material_is_refused(tmp_path):
 
 
 def assert_refused(path, message):
-    """Every function that reads the file must raise an error of one line that names the file."""
+    """Asserts that every function that reads the file raises an error of one line that names the file."""
     nested = {"type": "twosided", "bsdf": {"type": "measured", "filename": str(path)}}
     for load in (lambda: measured(path), lambda: from_dict(nested)):
         with pytest.raises(SourceError, match=message) as caught:

@@ -83,7 +83,7 @@ def test_python_reaches_the_functions_for_batches(tmp_path):
     again, density = runtime.eval_pdf(materials, wi, wo)
     np.testing.assert_allclose(again[pdf > 0], value[pdf > 0], rtol=1e-6)
     np.testing.assert_allclose(density[pdf > 0], pdf[pdf > 0], rtol=1e-6)
-    # These rows are not aligned to 16 bytes.
+    # The rows of `shifted` are not aligned to 16 bytes.
     shifted = np.empty(materials.size + 1, np.float32)[1:].reshape(materials.shape)
     shifted[:] = materials
     np.testing.assert_array_equal(runtime.eval_pdf(shifted, wi, wo)[0], again)

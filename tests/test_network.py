@@ -1,4 +1,4 @@
-"""Networks, encodings and adapters' numbers: they agree in all array packages and stay within their ranges."""
+"""Networks, encodings and adapters compute the same in all array packages, and decoded parameters stay in range."""
 
 from dataclasses import replace
 
@@ -16,7 +16,10 @@ from nma.target import PRINCIPLED_PARAMS
 
 
 def test_the_paper_s_network_has_7159_parameters():
-    """The paper's network: 100 learnt embeddings of 32 numbers, 33 inputs (with cos theta_i), 3x32, 23 outputs."""
+    """The paper's network has 33 inputs, three hidden layers of 32 neurons, and 23 outputs.
+
+    The inputs are cos(theta_i) and the 32 numbers of an embedding, of which 100 are learnt.
+    """
     assert target.output_size(2) == 23
     layers = network.init(np.random.default_rng(0), [33, *network.hidden("3x32"), target.output_size(2)])
     assert network.parameters(layers) + 100 * 32 == 7159
@@ -31,7 +34,10 @@ def test_networks_are_named_by_depth_and_width():
 
 @pytest.mark.parametrize("blocks", (False, True))
 def test_a_network_is_its_matrices(blocks, monkeypatch):
-    """The outputs equal matrix products with ReLU between the layers. One layer is larger than a block."""
+    """The outputs of a network equal matrix products with ReLU between the layers.
+
+    One layer has more neurons than the blocks of neurons in which the code for AVX-512 computes a layer.
+    """
     monkeypatch.setattr(network, "_many_registers", lambda value: blocks)
     rng = np.random.default_rng(3)
     layers = [
@@ -55,7 +61,10 @@ def test_a_network_is_its_matrices(blocks, monkeypatch):
 
 
 def test_initial_layers_have_the_spread_of_their_law():
-    """He 2015: outputs are about as large as inputs. The output bias is as given. Equal seeds give equal layers."""
+    """Initial weights have the spread of He 2015, so that the outputs of a layer are about as large as its inputs.
+
+    The last bias is the given array, and equal seeds give equal layers.
+    """
     layers = network.init(np.random.default_rng(0), [200, 300, 100], np.arange(100))
     assert layers[0][0].std() == pytest.approx(np.sqrt(2.0 / 200), rel=0.02)
     assert layers[1][0].std() == pytest.approx(0.1 * np.sqrt(2.0 / 300), rel=0.02)
@@ -89,7 +98,7 @@ def test_the_raw_encoding_is_the_paper_s_input():
 
 
 def test_encodings_agree_on_all_array_packages():
-    """Plain floats, NumPy and Dr.Jit give the same numbers."""
+    """The encoding of materials is the same for plain floats, NumPy and Dr.Jit."""
     params, mu = materials(50), np.linspace(0.0, 1.0, 50)
     on_numpy = np.stack(np.broadcast_arrays(*encoding.layered3(list(params.T), at_azimuth_0(mu))), axis=-1)
     columns = [dr.auto.Float(c.astype(np.float32)) for c in params.T]
@@ -107,7 +116,7 @@ def test_an_unknown_encoding_is_refused():
 
 
 def flat(brdf):
-    """The numbers of the BRDF's blend, as an array (lanes, size)."""
+    """Returns the parameters and weights of the BRDF's blend as an array (lanes, size)."""
     numbers = target.numbers(brdf.blend)
     dr.eval(numbers)
     lanes = [np.asarray(x.numpy() if dr.is_array_v(x) else x, np.float64) for x in numbers]
@@ -143,7 +152,7 @@ def test_only_directional_adapters_depend_on_the_direction(form, name):
 
 
 def test_curves_are_the_prepared_numbers():
-    """`Adapter.numbers` gives for each material and cosine the same numbers as `prepare`."""
+    """For each material and cosine, `Adapter.numbers` returns the parameters of the blend that `prepare` makes."""
     adapter, params, mu = random_adapter(), materials(3), np.array([0.0, 0.4, 1.0])
     curves = adapter.numbers(params, mu)
     for m in range(3):
@@ -154,7 +163,7 @@ def test_curves_are_the_prepared_numbers():
 
 
 def test_decoded_numbers_lie_in_their_ranges():
-    """Decoding keeps the numbers within their ranges even if the network's outputs are huge."""
+    """Decoded parameters are within their ranges even if the network's outputs are huge."""
     wild = random_adapter()
     wild = replace(wild, layers=[(100.0 * m, 100.0 * b) for m, b in wild.layers])
     curves = wild.numbers(materials(50), np.linspace(0.0, 1.0, 5))

@@ -39,7 +39,10 @@ def metal_of(vectors):
 
 
 def assert_laws(samples):
-    """Asserts that all samples, pairs of (values, cumulative distribution), pass a Kolmogorov-Smirnov test."""
+    """Asserts by Kolmogorov-Smirnov tests that random values follow their cumulative distributions.
+
+    `samples` holds pairs (values, cumulative distribution) by name.
+    """
     level = 1.0 - (1.0 - FALSE_ALARM) ** (1.0 / len(samples))
     for name, (values, cdf) in samples.items():
         assert stats.kstest(values, cdf).pvalue > level, name
@@ -47,9 +50,10 @@ def assert_laws(samples):
 
 @pytest.mark.parametrize("population", POPULATIONS)
 def test_every_parameter_follows_its_law(population):
-    """Parameters are drawn by the laws of the paper's Table 1: 10^U, U and 1 - U^2.
+    """Parameters have the distributions of the paper's Table 1: 10^U, U and 1 - U^2, where U is uniform.
 
-    The cumulative distribution of 1 - U^2 is 1 - sqrt(1 - x). A failure means that a parameter is drawn by another law.
+    The cumulative distribution of 1 - U^2 is 1 - sqrt(1 - x). A failure means that a parameter has another
+    distribution.
     """
     vectors = draw(population)
     logarithmic = {"alpha_top": (-3.0, 2.5), "alpha_bottom": (-3.0, 3.0)}
@@ -65,7 +69,10 @@ def test_every_parameter_follows_its_law(population):
 
 @pytest.mark.parametrize("population", ("range", "mixed"))
 def test_conductors_of_the_range_are_uniform(population):
-    """Conductors are uniform over the range: all of `range`, and the conductors of `mixed` that are no real metals."""
+    """In the population `range`, the values of eta and k of the conductors are uniform over their ranges.
+
+    In the population `mixed`, this is true of all conductors that are no real metals.
+    """
     vectors = draw(population)
     vectors = vectors[metal_of(vectors) < 0]
     samples = {}
@@ -102,7 +109,7 @@ def test_metals_are_drawn_evenly_from_their_own_list(population, held_out):
 
 
 def test_no_metal_held_out_is_ever_trained_on():
-    """No training draw has the values of a held-out metal, neither under its own name nor under another."""
+    """No material drawn for training has the values of a held-out metal, under its own name or another name."""
     corpus = load_conductors()
     values = np.hstack([corpus.eta, corpus.k])
     held_out = values[corpus.held_out]
@@ -232,7 +239,7 @@ def test_a_value_beyond_a_bound_is_refused_with_name_row_and_range(bounds, name,
 
 
 def test_rounding_beyond_a_bound_is_allowed():
-    """The ends of the range are accepted after rounding to single precision, and stay within the range."""
+    """Values at a bound are accepted after rounding to single precision, and `check` moves them into the range."""
     ends = np.stack(LAYERED3.columns("training"))
     rounded = ends.astype(np.float32)
     checked = LAYERED3.check(rounded, "training")

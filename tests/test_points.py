@@ -1,4 +1,4 @@
-"""Fits to sources with exact values: the points in which they are evaluated, the fits, and the figures of merit."""
+"""Fits to sources with exact values: the points at which sources are evaluated, the fits, and the figures of merit."""
 
 import math
 from dataclasses import replace
@@ -40,9 +40,10 @@ def pool_of(source, **sizes):
 
 
 def test_weighted_points_are_uniform_over_the_hemisphere():
-    """Means of weight times function over the points equal means over the hemisphere of wo, for every wi.
+    """For every wi, the weighted mean of a function over the points is its mean over the hemisphere of wo.
 
-    Points concentrate near peaks, and the weights undo that. A failure means that fits are biased to some directions.
+    More points lie near peaks than elsewhere, and their weights are smaller. A failure means that fits are biased
+    towards some directions.
     """
     pool = pool_of(LAMBERT)
     z, x = pool.wo[2], pool.wo[0]
@@ -56,7 +57,7 @@ def test_weighted_points_are_uniform_over_the_hemisphere():
 
 @pytest.mark.parametrize(("alpha", "albedo"), ((0.002, 1.0), (0.05, 0.99), (0.4, 0.76)))
 def test_points_find_narrow_peaks(alpha, albedo):
-    """The points alone give the albedo of a lobe within .02, even if the lobe is narrow.
+    """The weighted mean over the points estimates the albedo of a lobe within .02, even if the lobe is narrow.
 
     The lobes reflect all light that masking does not block.
     """
@@ -88,7 +89,10 @@ def test_negative_values_are_clamped_to_0_and_infinite_ones_refused():
 
 @pytest.mark.slow
 def test_a_fit_finds_a_principled_brdf():
-    """A small network learns a source that the target represents exactly: a log loss below .005 in 400 steps."""
+    """A small network learns a source that its target can represent exactly.
+
+    The fit reaches a log loss below .005 in 400 steps.
+    """
     source = Formula(lambda wi, wo: eval_principled(PLASTIC, wi, wo), name="plastic")
     adapter, run = fit(source, QUICK, {"data": "test"})
     found = compare(AdapterValues(adapter), source, Pairs.draw(4000))
@@ -174,7 +178,7 @@ def test_figures_of_comparisons_equal_closed_forms():
 
 
 def test_a_coat_reflects_above_its_metal():
-    """The source `Coating` is reciprocal, absorption in it only dims, and a coat of index 1 shows the metal alone."""
+    """The source `Coating` is reciprocal and darker with absorption. A coat of index 1 is invisible."""
     rng = np.random.default_rng(2)
     mu, phi = rng.uniform(0.1, 1.0, (2, 500)), rng.uniform(0.0, 6.28, (2, 500))
     wi, wo = (direction(m, p) for m, p in zip(mu, phi, strict=True))

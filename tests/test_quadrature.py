@@ -47,14 +47,14 @@ BINS = np.array(
 
 
 def shifted(n, shape, seed):
-    """Lattices of n points (3, n, *shape), each shifted at random."""
+    """Returns lattices of n points, as an array (3, n, *shape). Each lattice has its own random shift."""
     shift = np.random.default_rng(seed).random((3, 1, *shape))
     lattice = lattice_points(n).T.reshape(3, n, *(1,) * len(shape))
     return (lattice + shift) % 1.0
 
 
 def crowded(bins, n, seed, repeats=REPEATS):
-    """Points (n, repeats, bins) from `bin_points`."""
+    """Returns points (n, repeats, bins) from `bin_points`."""
     i, o, p = bins.T
     return quadrature.bin_points(i, o, p, tuple(shifted(n, (repeats, len(bins)), seed)))
 
@@ -65,9 +65,9 @@ def uniform(bins, n, seed, repeats=REPEATS):
 
 
 def assert_means(estimates, expected):
-    """t-tests that compare the means of `estimates` (repeats, ...) over the repetitions with `expected` (...)."""
+    """Compares the means of `estimates` (repeats, ...) over the repetitions with `expected` (...) by t-tests."""
     mean, spread = estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / math.sqrt(len(estimates))
-    # A smaller standard error would be dominated by rounding.
+    # The standard error has a lower limit, because rounding dominates smaller errors.
     t = np.abs(mean - expected) / np.maximum(spread, 1e-7 * np.abs(expected) + 1e-12)
     limit = stats.t.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / t.size)), len(estimates) - 1)
     worst = np.unravel_index(np.argmax(t), t.shape)
@@ -77,7 +77,7 @@ def assert_means(estimates, expected):
 
 
 def azimuth_away(points):
-    """The azimuth between wo and the mirror direction, 0 .. pi."""
+    """Returns the azimuth between wo and the mirror direction, in 0 .. pi."""
     return np.abs(np.arctan2(points.wo.y, -points.wo.x))
 
 
@@ -109,12 +109,13 @@ def test_means_of_smooth_functions_are_exact(law):
     "law", (quadrature.bin_points, quadrature.uniform_bin_points), ids=("crowded", "uniform")
 )
 def test_points_lie_in_their_bins(law, dtype):
-    """In all 64,000 bins, random points and the corners of the unit cube stay inside."""
+    """In all 64,000 bins, random points and the corners of the unit cube are mapped to points inside the bin."""
     i, o, p = (x.ravel().astype(dtype) for x in np.meshgrid(*[np.arange(40)] * 3, indexing="ij"))
     rng = np.random.default_rng(3)
     below_one = np.nextafter(dtype(1), dtype(0))
     corners = [np.full((3, len(i)), u, dtype) for u in (0.0, below_one)]
-    # Points keep cosines 1e-6 above the horizon. This may move the other direction's cosine out of its bin by as much.
+    # `bin_points` keeps the cosines of both directions 1e-6 above the horizon. To move one cosine up may move the other
+    # cosine out of its bin by 1e-6.
     slack = 1e-6 + 4 * np.finfo(dtype).eps
     for u in (*corners, rng.random((3, len(i)), dtype), rng.integers(0, 2, (3, len(i))) * below_one):
         points = law(i, o, p, tuple(u.astype(dtype)))
@@ -129,7 +130,7 @@ def assert_in_bins(points, i, o, p, slack):
         assert (mu <= (k + 1) / 40 + slack).all()
         assert mu.min() > 0
         assert mu.max() <= 1
-    # wi lies at azimuth 0. A vertical wo has no azimuth.
+    # wi lies at azimuth 0. Azimuths are not compared for a vertical wo, which has no azimuth.
     assert (points.wi.y == 0).all()
     away = azimuth_away(points)
     clear = points.wo.z < 1.0 - 1e-5
@@ -171,7 +172,7 @@ def graded(n):
     """Nodes and weights of a quadrature on 0 .. 1 whose nodes get denser towards both ends."""
     x, w = np.polynomial.legendre.leggauss(n)
     t = 0.5 * (x + 1.0)
-    # Substitute the regularised incomplete beta function B(4, 4), which is smooth, and flat at both ends.
+    # The substituted variable is the regularised incomplete beta function I_t(4, 4), which is flat at both ends.
     return t**4 * (35 - 84 * t + 70 * t**2 - 20 * t**3), 0.5 * w * 140 * t**3 * (1 - t) ** 3
 
 
@@ -219,12 +220,12 @@ def test_means_of_a_lobe_of_alpha_001_are_exact(lobe_means):
     points = crowded(np.array(LOBE_BINS, np.float64), 1 << 13, 6)
     estimates = (points.weight * lobe(points.wi, points.wo, 0.001)).mean(axis=0)
     assert_means(estimates / lobe_means, 1.0)
-    # The estimates must also be precise, or the test above would prove nothing.
+    # The estimates must also be precise. Otherwise the comparison of means would not detect errors.
     assert (estimates.std(axis=0, ddof=1) / math.sqrt(REPEATS) < 0.01 * lobe_means).all()
 
 
 def test_a_few_crowded_points_see_what_uniform_points_miss(lobe_means):
-    """Estimates of the mirror bin's mean from 20 points vary far more if the points are uniform."""
+    """From 20 points, estimates of the mirror bin's mean vary over 3 times as much with uniform points as with ours."""
     mirror = np.array(LOBE_BINS[:1], np.float64)
     spread = []
     for law in (crowded, uniform):

@@ -1,4 +1,7 @@
-"""The rooms of the package import only from lower floors, and the committed drawing shows all rooms and imports."""
+"""The rooms of the package (its top-level modules) import only from rooms on lower floors.
+
+The committed drawing shows all rooms and imports.
+"""
 
 import re
 
@@ -33,7 +36,7 @@ def test_the_committed_drawing_shows_the_current_imports():
 
 def test_the_drawing_has_every_room_and_every_arrow():
     text, arrows = drawing(), rooms.reduced(rooms.imports())
-    assert text.count('<path class="import"') == len(arrows) + 1  # and one in the legend
+    assert text.count('<path class="import"') == len(arrows) + 1  # the legend has one more arrow
     assert text.count('<path class="way"') == len(WAY) + 1
     names = re.findall(r'class="name"[^>]*>([^<]+)<', text)
     assert sorted(names) == sorted(room for floor in plan().floors for room in floor)
@@ -102,9 +105,9 @@ def test_the_page_names_registries_that_are_there():
 
 @pytest.fixture
 def ladder():
-    """Three floors of boxes, and the arrows between them. One arrow passes a floor.
+    """Three floors of boxes, and the arrows between them. The arrow from "a" to "end" passes the second floor.
 
-    The boxes of the second floor are in the wrong order: their arrows would cross.
+    The order of the boxes on the second floor is wrong, because arrows would cross.
     """
     floors = [["a", "b", "c"], ["z", "y", "x"], ["end"]]
     return floors, [("a", "x"), ("b", "y"), ("c", "z"), ("a", "end"), ("z", "end")]

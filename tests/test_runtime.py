@@ -17,7 +17,7 @@ from nma.ops import Vec3, at_azimuth_0
 from nma.params import MEASURED
 
 CASES = 4000
-# The count of numbers per instance. Its colour is one field of three numbers.
+# The count of numbers per instance. `Principled` has one field per number, except for the colour with three numbers.
 PRINCIPLED_SIZE = len(target.Principled._fields) + 2
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -118,7 +118,7 @@ def test_network_outputs_agree_on_every_instruction_set(name, compact):
     for instruction_set, outputs in found.items():
         error = np.abs(outputs - wanted) / (1.0 + np.abs(wanted))
         if instruction_set == "avx512_bf16":
-            # This instruction set rounds activations to the 8 significant bits of bfloat16.
+            # The instruction set avx512_bf16 rounds activations to the 8 significant bits of bfloat16.
             assert np.sqrt((error**2).mean()) < 0.02
             continue
         # A few inputs have larger errors, because the conductor's Fresnel term cancels digits.
@@ -160,7 +160,8 @@ def test_an_adapter_evaluates_like_the_package():
 def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hidden):
     """The values of a measured material agree within 2e-3.
 
-    The network has one input and no parameters. Lobes are stretched in the plane of incidence, flattened and faded.
+    The class has no parameters, so that cos(theta_i) is the only input of the network. Lobes are stretched in the plane
+    of incidence, flattened and faded.
     """
     rng, size = np.random.default_rng(14), target.output_size(2, target.MEASURED_PARAMS)
     layers = network.init(rng, [1, *hidden, size], rng.normal(size=size))
@@ -180,7 +181,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
 def test_curves_have_the_values_of_the_network():
     """Values from curves agree with values from the network: the median error is below 5e-4 of a value.
 
-    nma/render/curves.py states an error of about 1e-4 for this count of nodes.
+    nma/render/curves.py states a mean error of about 1e-4 for curves with the same count of nodes.
     """
     params, cosines = queries(8)
     wi = facing(cosines)
@@ -221,7 +222,7 @@ def test_samples_have_the_values_and_densities_of_eval():
 def test_samples_follow_the_density():
     """Samples of six materials follow their density (chi-square tests, false-alarm rate 1e-3 in all).
 
-    The lobes here are not narrow. tests/test_target_sampling.py tests the same functions of the package in double
+    The lobes in this test are not narrow. tests/test_target_sampling.py tests the package's sampling in double
     precision and for lobes of any width.
     """
     tests = 6

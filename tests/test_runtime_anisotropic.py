@@ -19,8 +19,8 @@ from nma.ops import Vec3
 
 RUNTIME = Path(__file__).parent.parent / "runtime"
 CASES = 4000
-# With AVX-512, the first network stays in registers and the second does not. The third has more padded inputs than
-# neurons per layer.
+# With AVX-512, the first network stays in registers and the second network does not. The third network has more padded
+# inputs than neurons per layer.
 NETWORKS = ("3x32", "2x64", "1x4")
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -52,7 +52,10 @@ def none():
 
 
 def close(a, b, instruction_set):
-    """Returns the share of rows that agree. The set avx512_bf16, which rounds activations, may be less exact."""
+    """Returns the share of rows in which `a` and `b` agree within a tolerance.
+
+    The tolerance is larger for the instruction set avx512_bf16, which rounds activations.
+    """
     rounded = instruction_set == "avx512_bf16"
     return np.isclose(a, b, rtol=0.1 if rounded else 2e-3, atol=2e-2 if rounded else 1e-4).all(axis=1).mean()
 
@@ -70,7 +73,7 @@ def test_network_outputs_are_those_of_the_package(case):
             assert np.sqrt((error**2).mean()) < 0.02
         else:
             assert error.max() < 1e-5
-    # A wrong azimuth changes the outputs far more than these errors.
+    # A wrong azimuth would change the outputs far more than rounding does.
     assert np.abs(turned - wanted).mean() > 0.3
 
 
@@ -171,7 +174,10 @@ def curves(compiler, tmp_path_factory):
 
 
 def test_anisotropic_adapters_have_no_curves(case, curves):
-    """C++ throws an error that says why, and C returns a null pointer."""
+    """A request for curves of an anisotropic adapter throws an error in C++, and returns a null pointer in C.
+
+    The error says that the adapter is anisotropic and must be prepared by direction.
+    """
     done = subprocess.run([curves, case[1]], capture_output=True, text=True, check=True)
     assert "anisotropic" in done.stdout and "prepare by direction" in done.stdout
     runtime = Runtime(case[1])

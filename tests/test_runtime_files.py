@@ -32,7 +32,7 @@ def stored(name):
 
 
 def header_of(name):
-    """Returns the header of a shipped file, its metadata about the adapter, and the bytes of its tensors."""
+    """Returns the parts of a shipped weights file: the header, the adapter's metadata, and the bytes of the tensors."""
     data = stored(name)
     size = struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8 : 8 + size])
@@ -59,7 +59,7 @@ def ranged(group, number, **fields):
 
 
 def shifted(places, gap=b""):
-    """Returns a weights file whose offsets of tensors are larger by `places`, with `gap` before the tensors."""
+    """Returns a weights file with the bytes `gap` before its tensors, whose offsets are larger by `places` bytes."""
     header, about, data = header_of("layered3-3x32")
     for entry in (entry for name, entry in header.items() if name != "__metadata__"):
         entry["data_offsets"] = [places + at for at in entry["data_offsets"]]
@@ -182,7 +182,7 @@ def test_unusual_but_valid_files_load(tmp_path):
 def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
     """The runtime accepts the recorded parameters up to rounding, also beyond the training range, and no others.
 
-    `nma.adapter.Adapter.check` has the same rule.
+    `nma.adapter.Adapter.check` in the package accepts and refuses the same parameters.
     """
     path, vector = tmp_path / "one.safetensors", LAYERED3.sample(np.random.default_rng(0), 1)[0]
     vector[12] = 3.0

@@ -1,4 +1,7 @@
-"""C++ BRDFs know their frame, whether they were prepared one by one, in a batch, or from curves."""
+"""BRDFs in C++ include the frame of their view direction, in all three ways to prepare them.
+
+BRDFs are prepared one by one, in a batch, or from curves.
+"""
 
 import ctypes
 from dataclasses import replace
@@ -15,7 +18,8 @@ from nma.params import MEASURED
 from nma.target.decode import TARGETS
 
 CASES = 500
-# How far values may differ, relative to their mean: rounding in the network, and for curves also interpolation.
+# The largest mean difference of values between C++ and the package, relative to the mean value. Differences are due to
+# rounding in the network and, for curves, to interpolation.
 WITHIN = {"single": 1e-4, "batch": 1e-4, "curves": 2e-2}
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -68,7 +72,7 @@ def test_stretched_brdfs_have_the_values_of_the_package_at_every_azimuth(stretch
 
 @pytest.mark.parametrize("way", WITHIN)
 def test_samples_leave_the_frame(stretched, directions, way):
-    """A sample has the value and the density of its own direction, which lies in the local frame."""
+    """A sampled direction is in the local frame: `eval_pdf` returns the same value and density for this direction."""
     _, runtime = stretched
     wi, _, u = directions
     brdfs = prepared(runtime, way, wi)
@@ -76,6 +80,6 @@ def test_samples_leave_the_frame(stretched, directions, way):
     valid = pdf > 0
     assert valid.mean() > 0.5
     again, density = runtime.eval_pdf(brdfs, wi, wo)
-    # A narrow lobe magnifies the rounding of the direction.
+    # In narrow lobes, rounding of the direction changes the value a lot, so that 2 % of the samples may differ.
     close = np.isclose(again, value, rtol=1e-2, atol=1e-4).all(axis=1) & np.isclose(density, pdf, rtol=1e-2)
     assert close[valid].mean() > 0.98

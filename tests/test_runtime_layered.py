@@ -24,7 +24,7 @@ CASES = {
     "thick": {"alpha_top": 0.15, "alpha_bottom": 1.0, "eta_top": 1.3, "sigma_t": 3.0},
     "index_matched": {"alpha_top": 0.2, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 0.3},
 }
-# These lobes are too narrow for the bins of a chi-square test. Their mean values are tested.
+# The lobes of this material are too narrow for the bins of a chi-square test, so that only mean values are tested.
 NARROW = {"alpha_top": 0.002, "alpha_bottom": 0.02, "eta_top": 1.5, "sigma_t": 0.5}
 COSINES = (1.0, 0.6, 0.1)
 ESTIMATORS = pytest.mark.parametrize("estimator", ["walk", "estimate"])
@@ -40,11 +40,12 @@ def view(mu):
 
 @pytest.fixture(scope="module")
 def bridge(compiler, tmp_path_factory):
-    # Dr.Jit does not fuse products and sums. With this flag the compiler does not either, and both round equally.
+    # Dr.Jit does not fuse products and sums. The flag -ffp-contract=off forbids the compiler to fuse them, so that C++
+    # and Dr.Jit round equally.
     library = built(compiler, "layered_bridge.cpp", tmp_path_factory.mktemp("layered"), "-ffp-contract=off")
 
     def call(name, inputs, shape):
-        """Calls a C function and returns its outputs as an array of this shape.
+        """Calls a C function and returns its outputs as an array of the given shape.
 
         All functions but `layered_albedo` have the count of rows as their first argument.
         """
@@ -69,7 +70,8 @@ def vec3(rows):
 def random_materials(rng, n):
     """Returns n random materials, float32 (n, 13).
 
-    A third is drawn from the training ranges, a third from the valid ranges, and a third from the hard cases.
+    About a third of the materials are drawn from the training ranges, a third from the valid ranges, and a third from
+    the hard cases.
     """
     low, high = LAYERED3.columns("valid")
     powers = [low[:2], np.maximum(low[2:], 1e-3)], [high[:2], np.minimum(high[2:], 100.0)]
@@ -81,7 +83,10 @@ def random_materials(rng, n):
 
 
 def random_views(rng, n):
-    """Returns random directions (n, 3). A quarter of them is spread evenly over decades of the cosine, down to 1e-4."""
+    """Returns random directions (n, 3).
+
+    In a quarter of the directions, the cosine is spread evenly over decades, down to 1e-4.
+    """
     z = np.where(rng.random(n) < 0.25, 10.0 ** rng.uniform(-4, 0, n), rng.random(n))
     phi, r = 2.0 * np.pi * rng.random(n), np.sqrt(1.0 - z * z)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
@@ -100,8 +105,8 @@ def beside_the_mirror(rng, wi, params):
 def test_density_is_that_of_the_package_case_by_case(bridge):
     """The density in C++ equals that of the package within 1e-4, for 4,000 materials and pairs of directions.
 
-    Both compute in single precision and round in the same way, so that they agree better with each other than with the
-    exact density. An index-matched coat at grazing angles, for example, reflects only by rounding.
+    C++ and the package compute in single precision and round in the same way. So their densities agree better with each
+    other than with the exact density. For example, an index-matched coat reflects light only because of rounding.
     """
     rng, n = np.random.default_rng(0), 4000
     params, wi, wo = random_materials(rng, n), random_views(rng, n), random_views(rng, n)
@@ -147,9 +152,9 @@ def reference(case, walks=1 << 20):
 def scores(bridge, estimator, params, tables, per_row=1 << 18, seed=5):
     """Returns |z| of the difference between a table in C++ and a table of the package's walks.
 
-    The estimator in C++ is "walk" or "estimate". Estimates are compared only in bins with a relative error below 3 %.
-    In other bins rare bright weights dominate if the coat is rough and the conductor smooth, and samples without such
-    a weight underestimate their error.
+    `estimator` says whether C++ fills its table from walks ("walk") or estimates ("estimate"). Estimates are compared
+    only in bins with a relative error below 3 %. In other bins, a few bright samples may dominate if the coat is rough
+    and the conductor smooth. If no bright sample is drawn, the stated error of the bin is too small.
     """
     sums, squares = np.zeros((2, *GRID.shape))
     about = np.ascontiguousarray(params, np.float32)
@@ -160,14 +165,14 @@ def scores(bridge, estimator, params, tables, per_row=1 << 18, seed=5):
 
 
 def bent_more(params):
-    """Returns the parameters of the same material with an index of the coat that is 2 % higher."""
+    """Returns the parameters of the material with a 2 % higher index of refraction of the coat."""
     return np.where(np.arange(len(params)) == 2, 1.02 * params, params)
 
 
 @ESTIMATORS
 @pytest.mark.parametrize("case", layered_cases.SLOW_CASES)
 def test_every_bin_is_that_of_the_package(bridge, case, estimator):
-    """Walks and estimates in C++ have the same means as walks of the package, in bins and in sums of bins.
+    """Walks and estimates in C++ have the same means as walks of the package, in every bin and every row of bins.
 
     The Z-tests have the false-alarm rate `FALSE_ALARM` per case; seeds are fixed.
     """
@@ -243,7 +248,8 @@ def test_weights_of_samples_have_the_mean_of_walks(bridge, case):
 def test_albedos_have_no_noise_and_are_close_to_those_of_many_walks(bridge):
     """An albedo is the mean of a fixed set of 256 walks, so that it has no noise between calls.
 
-    The albedo is within .1 of the mean of many walks. The standard deviation of 256 walks is at most .5 / 16.
+    The albedo is within .1 of the mean of many walks, because the mean of 256 walks has a standard deviation of at most
+    .5 / 16.
     """
     for values in (*CASES.values(), NARROW):
         for mu in COSINES:

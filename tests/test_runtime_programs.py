@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 RUNTIME = ROOT / "runtime"
 WEIGHTS = [ROOT / f"nma/adapter/trained/{name}.safetensors" for name in ("layered3-5x64", "layered3-3x32")]
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-pthread", f"-I{RUNTIME}"]
-# Only `make test-all` runs the tests with the second compiler, and most of the tests below.
+# Only `make test-all` runs the tests with clang++. It also runs most of the other tests in this file.
 COMPILERS = ["g++", pytest.param("clang++", marks=pytest.mark.slow)]
 ARM, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64-static"
 
@@ -26,7 +26,10 @@ def weights(tmp_path_factory):
 
 
 def tool(name):
-    """Returns the path of a program, or skips the test without it. `tools/setup.sh test` installs all programs."""
+    """Returns the path of a program. If the program is not installed, the test is skipped.
+
+    `tools/setup.sh test` installs all programs that the tests need.
+    """
     found = shutil.which(name)
     if found is None:
         pytest.skip(f"there is no {name} here")
@@ -61,8 +64,8 @@ def test_the_example_compiles_and_runs(compiler, tmp_path):
 def test_the_example_of_the_simulated_material_agrees_with_itself(tmp_path):
     """The four estimates of the same light in the example agree within 4.5 standard errors.
 
-    A false alarm happens in about one of ten thousand runs. The estimate that combines both samplings has a smaller
-    error than either sampling alone.
+    A false alarm happens in about one of ten thousand runs. The estimate that combines walks and evaluation has a
+    smaller error than walks alone or evaluation alone.
     """
     lines = output(built("g++", "example_layered.cpp", tmp_path, "-O2")).splitlines()[1:]
     means, errors = np.array([[float(x) for x in line.split()[-3::2]] for line in lines]).T

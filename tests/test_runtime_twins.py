@@ -1,4 +1,7 @@
-"""Code that is written by hand in Python and again in C++ computes the same. CONTRIBUTING.md lists all such twins."""
+"""Twins are code that is written by hand in Python and again in C++. The tests compare the results of twins.
+
+CONTRIBUTING.md lists all twins.
+"""
 
 import ctypes
 import re
@@ -44,7 +47,7 @@ def drawn(space, rng):
 
 
 def views(rng):
-    """Returns random view directions (n, 3). Some are the normal itself, and some are near the horizon."""
+    """Returns random view directions (n, 3). Some directions are the normal itself, and some are near the horizon."""
     wi = rows(random_directions(rng, CASES)).astype(np.float32)
     wi[:100] = (0.0, 0.0, 1.0)
     wi[100:200, 2] = 1e-4
@@ -54,9 +57,10 @@ def views(rng):
 @pytest.mark.parametrize("instances", [1, 2, 3, 4, 5, 8])
 @pytest.mark.parametrize("name", TARGETS)
 def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, instances):
-    """Random outputs are decoded to the same parameters, within 1e-6, for every target and count of instances.
+    """C++ decodes the outputs of a network to the same parameters as Python, within 1e-6.
 
-    Some outputs are so large that a sigmoid rounds to its limit.
+    The test covers every target and several counts of instances. The outputs are random, and some are so large that a
+    sigmoid rounds to its limit.
     """
     rng, size = np.random.default_rng(instances), output_size(instances, TARGETS[name])
     matrix = rng.normal(size=(size, LIBRARY.size + 1)) * np.where(rng.random((size, 1)) < 0.1, 20.0, 0.5)
@@ -78,11 +82,14 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
 
 @pytest.mark.parametrize(
     "name, directional",
-    # Anisotropic adapters always follow the direction.
+    # The outputs of an anisotropic adapter always depend on the direction.
     [(name, d) for name in encoding.ENCODERS for d in (True, False) if d or name not in encoding.ANISOTROPIC],
 )
 def test_networks_have_the_same_inputs(tmp_path, name, directional):
-    """Every encoding gives the network the same inputs. The network here is an identity, which outputs its inputs."""
+    """Every encoding computes the same inputs of the network in C++ as in Python.
+
+    The network in this test is the identity, so that its outputs are its inputs.
+    """
     rng, space, params = np.random.default_rng(5), CLASS_OF[name], TARGETS["principled"]
     inputs, size = encoding.size(name, space, directional), output_size(4, params)
     path = saved(tmp_path, space, name, 4, directional, params, np.eye(size, inputs), np.zeros(size))

@@ -167,7 +167,7 @@ end_header
 def test_attributes_of_a_mesh_are_clamped_to_the_range(kind, tmp_path):
     """Vertex colours beyond the range render like the constant 1, alone and inside a checkerboard.
 
-    Loading cannot check these colours, because only the mesh has their values.
+    Vertex colours cannot be checked when the BSDF is loaded, because only the mesh has their values.
     """
     (tmp_path / "plate.ply").write_text(PLATE)
     colours = {"type": "mesh_attribute", "name": "vertex_color"}

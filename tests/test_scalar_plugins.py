@@ -73,12 +73,15 @@ def test_scalar_and_vectorised_plugins_render_the_same():
     for mine, other in zip(scalar, vectorised, strict=False):
         assert agree(mine, other), (mine.mean(axis=0), other.mean(axis=0))
     assert agree(scalar[-1], vectorised[0])
-    # Other materials differ by more than that, so the comparison can fail.
+    # Pictures of two different materials do not agree, so that the comparison can detect errors.
     assert not agree(scalar[0], vectorised[2])
 
 
 def test_scalar_and_vectorised_plugins_render_anisotropic_adapters_the_same(tmp_path):
-    """Both plugins render the same picture. An adapter that ignores the azimuth has a different picture."""
+    """The scalar plugin and the vectorised plugin render the same picture of an anisotropic adapter.
+
+    The picture of an adapter that ignores the azimuth is different.
+    """
     adapter = random_anisotropic_adapter()
     (matrix, bias), *rest = adapter.layers
     blind = dataclasses.replace(adapter, layers=[(matrix * np.float32([1, 0, 0, 0, 0]), bias), *rest])
@@ -103,14 +106,14 @@ def mask(opacity, bsdf):
 
 
 def test_composites_are_linear_combinations_of_their_parts():
-    """The picture of a composite is the weighted mean of the pictures of its parts, for a plate before the sky.
+    """The picture of a composite is the weighted mean of the pictures of its parts, for a plate in front of the sky.
 
-    Z-tests of 24 means allow 5 standard errors, estimated from 32 renderings: a false alarm in two thousand runs. A
-    failure means that a part inside a composite is evaluated or sampled wrongly.
+    Z-tests of 24 means allow 5 standard errors, which are estimated from 32 renderings. A false alarm happens in about
+    one of two thousand runs. A failure means that a part inside a composite is evaluated or sampled wrongly.
     """
     layered, nma, diffuse = {"type": "layered", **MATERIAL}, {"type": "nma", **MATERIAL}, {"type": "diffuse"}
     flat = {"type": "normalmap", "normalmap": {"type": "srgb", "color": [0.5, 0.5, 1.0]}}
-    # Each composite has the shares that layered, nma, diffuse and the sky contribute to its picture.
+    # Each composite, with the weights of four pictures in its picture: of layered, of nma, of diffuse, and of the sky.
     composites = {
         "blend": (blend(0.3, layered, diffuse), (0.7, 0, 0.3, 0)),
         "mask": (mask(0.6, layered), (0.6, 0, 0, 0.4)),

@@ -1,4 +1,7 @@
-"""An adapter of one material records the parameters. Users may leave parameters out, and others are refused."""
+"""An adapter of one material records the parameters of that material.
+
+Users may leave the parameters out. Parameters that differ from the record are refused.
+"""
 
 import json
 import math
@@ -25,7 +28,7 @@ GOLD = materials.load("gold-red-lacquer")
 
 
 def of_gold(**record):
-    """Returns an adapter whose record names gold under red lacquer. Its appearance is arbitrary."""
+    """Returns an adapter with random weights whose record names the material gold under red lacquer."""
     adapter = random_adapter(hidden="1x8", name="direction")
     return replace(adapter, training={"material": GOLD.name, "params": GOLD.vector().tolist(), **record})
 
@@ -48,7 +51,7 @@ def values(description):
 def test_the_weights_file_records_its_material(weights):
     np.testing.assert_array_equal(Adapter.load(weights).material, GOLD.vector())
     assert random_adapter().material is None  # an adapter of a whole class
-    assert random_adapter(name="direction").material is None  # a file from before materials were recorded
+    assert random_adapter(name="direction").material is None  # a file of an older version, without a record
 
 
 def test_only_the_recorded_material_is_accepted_up_to_rounding(weights):

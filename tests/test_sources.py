@@ -33,7 +33,7 @@ COSINES = (0.0, 1e-30, 1e-12, 1e-8, 1e-7, 1e-5, 1e-3)
 
 
 def grazing(cosines, n=500):
-    """Pairs of directions. In each pair, one direction or both have one of the `cosines`.
+    """Returns pairs of directions. In each pair, at least one direction has a cosine from `cosines`.
 
     The azimuths of a pair are equal, opposite, or 1 rad apart.
     """
@@ -63,7 +63,7 @@ def test_values_at_the_horizon_are_finite(name):
 
 @pytest.mark.parametrize("name", ("paper_white", "cg_sunflower"))
 def test_measured_values_at_the_horizon_are_finite(measurements, name):
-    """Values at the horizon hardly exceed the largest value slightly above it, which is that of the forward peak."""
+    """Values at the horizon are at most 10 % larger than the forward peak slightly above the horizon."""
     source = sources.read(measurements / "rgl" / f"{name}_rgb.bsdf")
     peak = numbers(source.eval(*grazing((1e-4, 1e-3, 1e-2)))).max()
     assert_finite(source, 1.1 * peak)
@@ -105,7 +105,7 @@ def test_every_format_with_measurements_tells_which_a_file_is_of(ending):
 
 
 def test_a_new_format_is_a_file_and_a_line(monkeypatch, tmp_path):
-    """Once a format is registered, its files can be read and collected, and error messages list it."""
+    """Once a file format is registered, files of the format can be read and collected, and error messages list it."""
     module = types.ModuleType("nma.sources.grey")
     module.FORMAT = Format("Grey", lambda path: Coating(alpha=float(path.read_text())))
     monkeypatch.setitem(sys.modules, "nma.sources.grey", module)

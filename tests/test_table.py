@@ -32,7 +32,10 @@ ROUGH = {
 
 
 class Scatter:
-    """A source with a single event. The method `draw` of a subclass returns wo and a factor of the throughput."""
+    """A source whose walks end after one scattering event.
+
+    The method `draw` of a subclass returns wo and a factor of the throughput.
+    """
 
     space = ParamSpace("scatter", (Param("rho", "rho", "uniform", 0.0, 1.0, 0.0, 1.0, "its colour", 3),))
 
@@ -79,7 +82,7 @@ def middles(n):
 
 
 def assert_table(tables, expected):
-    """A Z-test of every bin with the table's own standard error, and a chi-square test over all bins."""
+    """Tests every bin by a Z-test with the table's own standard error, and all bins together by a chi-square test."""
     z = (tables.values[..., 0].astype(np.float64) - expected) / tables.error[..., 0]
     limit = norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / z.size)))
     assert np.abs(z).max() < limit
@@ -148,16 +151,18 @@ def test_standard_errors_are_the_spread_of_independent_tables():
 
 
 def test_the_folded_table_equals_the_folded_anisotropic_one():
-    """A pair of azimuth bins of the full table covers a range of differences, with a triangular density.
+    """The full table, with the azimuths of wi and wo, agrees with the folded table of their difference.
 
-    The folded table, averaged with this density, must give the value of the pair.
+    For a pair of azimuth bins of the full table, the density of azimuth differences is triangular. So the mean of the
+    folded table, weighted with a triangle, must equal the value of the full table.
     """
     steps, fine = 8, 8
     params, source = LAYERED3.vector(ROUGH)[None], sources.get("layered3")
     full = tabulate(source, params, 1 << 20, stream_keys(1, [0]), grid=Grid(3, 3, steps, phi_i=steps))
     folded = tabulate(source, params, 1 << 21, stream_keys(2, [0]), grid=Grid(3, 3, steps * fine // 2))
 
-    # The full table by the difference d of the two azimuth bins, averaged over wi: (theta_i, theta_o, d).
+    # The mean of the full table over the azimuth of wi, as an array (theta_i, theta_o, d). The index d is the
+    # difference between the azimuth bins of wi and wo.
     shifted = [np.roll(full.values[0][:, a], -a, axis=2) for a in range(steps)]
     by_difference = np.mean(shifted, axis=0)[..., 0].astype(np.float64)
     variance = (
@@ -165,7 +170,7 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         / steps**2
     )
 
-    # The folded table, unfolded to the whole circle. Then average it with the triangle around each difference.
+    # Unfold the folded table to the whole circle. Then average the circle with a triangle of weights around each d.
     circle = np.concatenate([folded.values[0, ..., 0], folded.values[0, ..., ::-1, 0]], axis=2)
     noise = np.concatenate([folded.error[0, ..., 0], folded.error[0, ..., ::-1, 0]], axis=2)
     expected, expected_variance = np.empty_like(by_difference), np.empty_like(by_difference)
@@ -175,7 +180,8 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         weights = np.maximum(1.0 - away, 0.0)
         weights /= weights.sum()
         expected[..., d] = circle @ weights
-        # Both halves of the circle are the same bins, so add their errors before squaring.
+        # The two halves of the circle contain the same bins with the same errors. So the weights of the halves are
+        # added before they are squared.
         halves = weights[: steps * fine // 2] + weights[steps * fine // 2 :][::-1]
         expected_variance[..., d] = noise[..., : steps * fine // 2] ** 2 @ halves**2
     z = np.abs(by_difference - expected) / np.sqrt(variance + expected_variance)
@@ -211,7 +217,10 @@ def test_launches_of_an_anisotropic_table_continue_each_other(monkeypatch):
 
 
 def test_no_bin_overflows():
-    """All walks of a row end in one bin with throughput 1. There are more walks than one launch may count."""
+    """The counts of a table do not overflow if all walks of a row end in the same bin with throughput 1.
+
+    The row has more walks than one launch may count.
+    """
 
     class Up(Scatter):
         def draw(self, wi, u1, u2):
@@ -270,7 +279,10 @@ def test_saved_tables_come_back(tables, tmp_path):
 
 
 def test_one_number_of_walks_and_half_precision_are_enough(tables, tmp_path):
-    """These variants of the reference-file format (CONVENTIONS.md) are valid; other programs may write them."""
+    """A reference file may have one count of walks for all materials, and values in half precision (CONVENTIONS.md).
+
+    Other programs may write such files.
+    """
     path = tmp_path / "theirs.npz"
     np.savez(path, params=tables.params, table=tables.values.astype(np.float16), walks=819_200)
     back = Tables.load(path)

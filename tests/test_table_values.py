@@ -1,4 +1,4 @@
-"""Tables of sources that can be evaluated, compared with closed forms and quadratures, and tables as such sources."""
+"""Tables of sources that can be evaluated, compared with closed forms and quadratures, and tables used as sources."""
 
 import math
 
@@ -38,7 +38,7 @@ def ggx(alpha):
 
 
 def lopsided(wi, wo):
-    """mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi)."""
+    """Returns f cos(theta_o) = mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi), for test purposes."""
     sin_i, sin_o = (ops.maximum(ops.safe_sqrt(1.0 - w.z * w.z), 1e-6) for w in (wi, wo))
     return Color.of(wi.z * wo.z * (2.0 + wi.x / sin_i) * (2.0 + wo.y / sin_o) * (1.0 / (18.0 * math.pi)))
 
@@ -56,9 +56,10 @@ def test_bins_of_a_lambertian_surface_hold_their_means(grid):
 
 
 def assert_close(tables, expected, grid):
-    """Compares a table of a linear function with its means.
+    """Asserts that the bins of a table hold the means of a linear function.
 
-    Bins with even points must be almost exact. Bins near the mirror direction must be within their stated errors.
+    Bins near the mirror direction must be within their stated errors. All other bins must be almost exact, because
+    their points are evenly spread.
     """
     near = values._near_mirror(np.arange(grid.bins), grid).reshape(grid.shape[:-1])
     found, error = tables.values[0], tables.error[0]
@@ -67,7 +68,7 @@ def assert_close(tables, expected, grid):
 
 
 def assert_as_stated(found, expected, error):
-    """The deviations are small, and their variance is about the stated one or less."""
+    """Asserts that deviations are small and that their variance is less than twice the stated variance."""
     deviation = (found - expected).astype(np.float64)
     assert np.sum(deviation**2) < 2.0 * np.sum(error.astype(np.float64) ** 2)
     assert np.abs(deviation).sum() < 0.015 * expected.sum()
@@ -108,7 +109,7 @@ def test_a_folded_bin_is_the_mean_of_both_mirror_halves():
 
 @pytest.mark.parametrize("alpha", (0.001, 0.1))
 def test_peaks_of_a_rough_conductor_are_those_of_the_quadrature(alpha):
-    """Mitsuba's conductor, averaged over our points, equals brute-force quadrature, for a narrow and a wide lobe.
+    """The means of Mitsuba's conductor over our points equal brute-force quadrature, for a narrow and a wide lobe.
 
     The narrow lobe is thirty times narrower than a bin.
     """
@@ -117,29 +118,33 @@ def test_peaks_of_a_rough_conductor_are_those_of_the_quadrature(alpha):
     found = np.array([tables.values[0][bin][0] for bin in LOBE_BINS])
     np.testing.assert_allclose(found, expected, rtol=0.03)
     error = np.array([tables.error[0][bin][0] for bin in LOBE_BINS])
-    # Student's t with three degrees of freedom exceeds 13 once in a thousand cases.
+    # The limit is 13 standard errors. Student's t with three degrees of freedom exceeds 13 once in a thousand cases.
     assert (np.abs(found - expected) < 13 * error + 2e-3 * expected).all()
 
 
 def test_a_narrow_lobe_of_an_anisotropic_table_folds_to_the_isotropic_one():
-    """For each pair of elevations, both tables have the same mean over all azimuths."""
+    """For each pair of elevations, the anisotropic and the isotropic table have the same mean over all azimuths."""
     full = tabulate_values(ggx(0.01), grid=Grid(6, 6, 12, phi_i=12)).values[0, ..., 0]
     folded = tabulate_values(ggx(0.01), grid=Grid(6, 6, 12)).values[0, ..., 0]
     np.testing.assert_allclose(full.mean(axis=(1, 3)), folded.mean(axis=-1), rtol=0.02)
-    # The table is the same for every azimuth of wi, as the material is isotropic.
+    # The anisotropic table is the same for every azimuth of wi, because the material is isotropic.
     shifted = np.array([np.roll(full[:, a], -a, axis=-1) for a in range(12)])
     assert np.mean(shifted.std(axis=0)) < 0.02 * np.mean(shifted)
 
 
 def test_stated_errors_are_the_spread_of_the_means():
-    """Squared deviations from a table with 16 times the points are about as large as the stated variance."""
+    """The squared errors of a table are about as large as its stated variance.
+
+    The errors are the deviations from a table with 16 times as many points.
+    """
     source = ggx(0.2)
     tables, better = (tabulate_values(source, grid=Grid(10, 10, 10), points=n) for n in (64, 1024))
     deviation = (tables.values - better.values).astype(np.float64)[..., 0]
     stated = tables.error.astype(np.float64)[..., 0]
     assert 0.5 < np.sum(deviation**2) / np.sum(stated**2) < 2.0
     assert 0.5 < np.median(np.abs(deviation)) / np.median(stated) < 1.2
-    # With `walks` random walks, about half of the bins would have a larger error than the stated one.
+    # A table states a count of random walks of similar accuracy. With that count of walks, about half of the bins would
+    # have a larger error than the table states.
     counting = metrics.counting_error(
         tables.values[0], int(tables.walks[0]), Grid(10, 10, 10).solid_angle, 10
     )
@@ -196,7 +201,10 @@ def test_a_table_as_a_source_gives_the_table_again(grid):
 
 
 def test_a_table_as_a_source_knows_its_bins():
-    """A pair of directions gets the value of its bin, whatever the azimuth of wi and the sign of the difference."""
+    """A pair of directions gets the value of its bin.
+
+    The value depends neither on the azimuth of wi nor on the sign of the azimuth difference.
+    """
     tables = random_tables(SMALL)
     wi, wo = pairs(2000)
     found = numbers(TableValues(tables).eval(wi, wo))
@@ -282,7 +290,7 @@ def test_points_of_anisotropic_bins_have_no_preference(crowded):
 
 
 def test_crowded_points_of_anisotropic_bins_have_the_mean_of_even_ones():
-    """The mean of a lobe of alpha .05 over two mirror bins agrees with that of many more uniform points."""
+    """Over two mirror bins, the mean of a lobe of alpha .05 is the same with our points as with many uniform points."""
     grid, bins = Grid(6, 6, 12, phi_i=12), FOUR[[0, 3]]
     i, a, o, b = bins.T
     means = []

@@ -1,4 +1,4 @@
-"""The target equals Mitsuba's `principled`, obeys its laws, and is the same in all array packages and precisions."""
+"""The target equals Mitsuba's `principled`, is reciprocal and finite, and is the same in all array packages."""
 
 import warnings
 
@@ -41,7 +41,7 @@ def lobe_directions(rng, blend, wi):
 
 
 class Oracle:
-    """Mitsuba's `principled` with n parameter sets at once. Its textures have one texel per set."""
+    """Mitsuba's BSDF `principled` with n parameter sets at once, which are stored as the texels of textures."""
 
     def __init__(self, p: Principled):
         mi.set_variant("llvm_ad_rgb")
@@ -78,12 +78,15 @@ class Oracle:
 def test_eval_equals_mitsuba_principled():
     """Our values equal Mitsuba's within 1e-4 relative, for 10,000 parameter sets with alpha down to .001.
 
-    Half of the directions are sampled from the lobes. Mitsuba computes in single precision, so that two cases are
-    allowed a larger difference. Its clearcoat contains the sum 1 + (alpha^2 - 1) cos^2, so that this lobe may be wrong
-    by a few rounding errors over that sum. If the two directions graze and are opposite within a hundredth, the cosine
-    to the half vector loses digits, and 2e-3 is allowed. Directions closer than .001 to the horizon are not compared:
-    there this cosine may be negative, and Mitsuba returns zero. A failure means that our formulas differ from
-    Mitsuba's.
+    Half of the directions are sampled from the lobes. A failure means that our formulas differ from Mitsuba's. Mitsuba
+    computes in single precision, so that the test allows larger differences in two cases:
+    - The clearcoat is divided by the sum 1 + (alpha^2 - 1) cos^2(theta_h). The relative error of the clearcoat may be
+      a few rounding errors, divided by this sum.
+    - If both directions are grazing, and opposite within a hundredth, the cosine between direction and half vector
+      loses digits. The allowed relative difference is 2e-3.
+
+    Directions whose cosine is below .001 are not compared. Near the horizon, Mitsuba's cosine between direction and
+    half vector may become negative by rounding, and Mitsuba returns zero.
     """
     rng = np.random.default_rng(11)
     n = 10_000
@@ -113,16 +116,16 @@ def test_eval_equals_mitsuba_principled():
         plain = (allowance < 1e-5 * np.abs(value)) & ~opposite
         worst = max(worst, np.max((error / (np.abs(value) + 1e-9))[plain]))
         allowed += np.sum(~plain.all(axis=0))
-    # In at least 92 % of the cases no allowance matters, and the values agree within single precision.
+    # In at least 92 % of the cases the larger limits do not matter, and the values agree within single precision.
     assert allowed < 0.08 * 16 * n
     assert worst < 2e-5
 
 
 @pytest.mark.parametrize("gloss", (0.0, 0.3, 0.9, 1.0))
 def test_clearcoat_distribution_is_normalised(gloss):
-    # Single precision spoils the comparison of clearcoats with Mitsuba, so that this integral tests their scale:
-    # int D cos(theta_h) dm = 1. As a function of s = sin^2 the integrand is pi D. The variable x = log(s + alpha^2)
-    # spreads its peak evenly.
+    # Rounding in Mitsuba prevents a precise comparison of clearcoats. So this test checks the scale of the clearcoat's
+    # distribution D: the integral of D cos(theta_h) over all half vectors is 1. With the variable s = sin^2(theta_h),
+    # the integrand is pi D. The variable x = log(s + alpha^2) spreads the peak of D evenly.
     alpha = clearcoat_alpha(gloss)
     low, high = np.log(alpha**2), np.log(1 + alpha**2)
     x = low + (high - low) * (np.arange(20_000) + 0.5) / 20_000
@@ -183,7 +186,7 @@ def test_ten_million_evaluations_are_finite_and_not_negative():
     rng = dr.llvm.PCG32(size=n, initstate=15)
 
     def number(low=0.0, high=1.0):
-        # About a quarter of all values lie at an end of their range.
+        # About a quarter of all numbers lie at an end of their range.
         u = rng.next_float32()
         return low + (high - low) * dr.clip(1.3 * u - 0.15, 0.0, 1.0)
 
@@ -202,7 +205,7 @@ def test_ten_million_evaluations_are_finite_and_not_negative():
     weight = number()
     blend = Blend((instance(), instance()), (weight, 1.0 - weight))
     wi, wo = direction(), direction()
-    # Every tenth pair is exactly opposite along the surface.
+    # In every tenth pair, the azimuths of the two directions are opposite.
     opposite = rng.next_float32() < 0.1
     wo = Vec3(dr.select(opposite, -wi.x, wo.x), dr.select(opposite, -wi.y, wo.y), wo.z)
     value, pdf = target.eval_pdf(blend, wi, wo)
@@ -245,7 +248,7 @@ def test_derivatives_equal_finite_differences():
     rng = np.random.default_rng(17)
     with jax.enable_x64(True), warnings.catch_warnings():
         raw = jnp.asarray(rng.normal(size=(300, 23)))
-        # Finite differences vary the cosine and the azimuth of each direction. Directions stay above the horizon.
+        # Directions are given by cosine and azimuth, so that finite differences do not move them below the horizon.
         cosines, phis = rng.uniform(0.05, 0.95, (2, 300)), rng.uniform(0, 6, (2, 300))
         near = rng.random(300) < 0.5
         cosines[1] = np.where(near, np.clip(cosines[0] + rng.normal(size=300) * 0.02, 0.05, 0.99), cosines[1])
@@ -276,7 +279,7 @@ def test_derivatives_equal_finite_differences():
 def test_single_precision_keeps_its_digits():
     """Dr.Jit and JAX in single precision equal NumPy in double precision within 2e-5 relative, also in the peaks.
 
-    All three get the same inputs, which are rounded to single precision.
+    NumPy, Dr.Jit and JAX get the same inputs, which are rounded to single precision.
     """
     rng = np.random.default_rng(18)
     n = 100_000

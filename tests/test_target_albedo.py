@@ -50,7 +50,10 @@ def estimate(blend, mu):
 
 
 def random_blends(params, instances, seed, scale):
-    """Returns CASES random blends and cosines. Parameters span their ranges, often at an end. Many cosines graze."""
+    """Returns CASES random blends and cosines.
+
+    The parameters span their ranges and are often at an end. Many of the cosines are near 0.
+    """
     rng = np.random.default_rng(seed)
     mu = np.maximum(rng.random(CASES) ** rng.choice([1.0, 3.0], CASES), 1e-3)
     raw = rng.normal(size=(output_size(instances, params), CASES)) * scale

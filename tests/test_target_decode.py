@@ -91,7 +91,7 @@ def test_encode_is_finite_at_the_ends_of_ranges():
     raw = encode(Blend((p, p), (1.0, 0.0)))
     assert np.all(np.isfinite(raw))
     assert decode(raw, 2).instances[0].metallic == pytest.approx(1.0, abs=1e-5)
-    # The first weight of 1 leaves a rest of 0 for the other two, whose split is then undefined.
+    # If the first weight is 1, the other two weights are 0, and their ratio is undefined.
     assert np.all(np.isfinite(encode(Blend((p, p, p), (1.0, 0.0, 0.0)))))
 
 

@@ -1,4 +1,4 @@
-"""The frame of the plane of incidence is a rotation about the normal. `leave` is the inverse of `enter`."""
+"""The frame of the plane of incidence: `enter` rotates a direction about the normal, and `leave` rotates it back."""
 
 import numpy as np
 

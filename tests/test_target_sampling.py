@@ -1,7 +1,8 @@
 """Chi-square tests of `sample` against `pdf`, in bins that adapt to the lobes, and tests of the lobe probabilities.
 
-The tests compute in double precision. At grazing angles the narrowest lobes are 1e-5 wide. Rounding to single precision
-moves samples between such narrow bins. Tests in test_target.py show that both precisions draw the same directions.
+The tests compute in double precision. At grazing angles, the narrowest lobes are only 1e-5 wide, and rounding to single
+precision would move samples from one bin to another. Tests in test_target.py show that single and double precision draw
+the same directions.
 """
 
 import drjit as dr
@@ -21,7 +22,7 @@ ensure_llvm()
 
 N_BLENDS = 200
 DEPTH = 7  # 2^7 = 128 bins per blend
-FINE = 10  # 2^10 boxes per blend: each bin is integrated over at least 8
+FINE = 10  # 2^10 boxes per blend, so that each bin is integrated over at least 8 boxes
 PILOT = 1 << 13
 SAMPLES = 100_000
 FAMILY_ERROR = 1e-3  # the chance that a correct sampler fails at least one of the 200 tests
@@ -108,14 +109,17 @@ def draw(cases, count, seed, alpha_scale=1.0):
 
 
 def draw_lobes(cases, count, seed):
-    """Draws equally many samples from every lobe of every instance, independent of weights. All samples are valid."""
+    """Draws equally many samples from every lobe of every instance, without regard to weights.
+
+    All samples are valid.
+    """
 
     def sampler(blend, wi, lane, u):
         wo = sample_diffuse(u[1], u[2])
         for k, (alpha_x, alpha_y, alpha_c) in enumerate(target.lobe_alphas(blend)):
             wo = ops.select(lane % 11 == 2 * k + 1, sample_spec(wi, alpha_x, alpha_y, u[1], u[2]), wo)
             wo = ops.select(lane % 11 == 2 * k + 2, sample_clearcoat(wi, alpha_c, u[1], u[2]), wo)
-        # Uniform directions replace samples below the horizon, which are useless for placing bins.
+        # Uniform directions replace samples below the horizon, because only samples above the horizon define bins.
         z = u[1]
         r = dr.sqrt(1.0 - z * z)
         uniform = Vec3(r * dr.cos(dr.two_pi * u[2]), r * dr.sin(dr.two_pi * u[2]), z)
@@ -125,7 +129,10 @@ def draw_lobes(cases, count, seed):
 
 
 def adaptive_bins(boxes, a, b):
-    """Cuts `boxes` (n, 1, 4) at medians of the samples. Returns boxes (n, 2^FINE, 4) and the cuts per level."""
+    """Cuts `boxes` (n, 1, 4) FINE times at the medians of the samples in each box.
+
+    Returns the resulting boxes (n, 2^FINE, 4), and the positions of the cuts at each level.
+    """
     n = len(boxes)
     points = np.stack([a.numpy(), b.numpy()], -1).reshape(n, 1, -1, 2)
     cuts = []
@@ -145,7 +152,7 @@ def adaptive_bins(boxes, a, b):
 
 
 def counts(a, b, cuts):
-    """Counts the samples in each bin. The result is (n, 2^DEPTH + 1), and the last column counts invalid samples."""
+    """Returns the counts of samples in each bin, (n, 2^DEPTH + 1). The last column counts invalid samples."""
     n, size, UInt = len(cuts[0]), 2**DEPTH, dr.llvm.UInt
     row = dr.arange(UInt, len(a)) // (len(a) // n)
     node = dr.zeros(UInt, len(a))
@@ -177,7 +184,10 @@ def integrate(cases, index, boxes, order=6):
 
 
 def integrate_adaptively(cases, boxes, tolerance=2e-6):
-    """Returns the integrals (n, 2^DEPTH) of the density. Boxes are quartered until the quarters sum up to the whole."""
+    """Returns the integrals (n, 2^DEPTH) of the density over all bins.
+
+    A box is divided into quarters until the integrals over the quarters add up to the integral over the box.
+    """
     n, bins, _ = boxes.shape
     owner = np.arange(n * bins)
     parts = boxes.reshape(-1, 4)
@@ -200,7 +210,7 @@ def integrate_adaptively(cases, boxes, tolerance=2e-6):
 
 @pytest.fixture(scope="module")
 def bins():
-    """Random blends, the cuts of their bins, and the probabilities (n, 2^DEPTH + 1) of the bins.
+    """Random blends, the cuts of their bins, and the probability that a sample lies in each bin (n, 2^DEPTH + 1).
 
     The last column is the probability of an invalid sample.
     """
@@ -220,7 +230,7 @@ def p_values(bins, seed, alpha_scale=1.0):
 
 
 def pooled_p_value(observed, expected):
-    """Returns the p-value of a chi-square test. All bins that expect fewer than 5 samples are merged into one."""
+    """Returns the p-value of a chi-square test. All bins with fewer than 5 expected samples are merged into one bin."""
     small = expected < 5
     observed = np.append(observed[~small], observed[small].sum())
     expected = np.append(expected[~small], expected[small].sum())
@@ -248,7 +258,7 @@ def test_samples_follow_their_density(bins):
 def test_samples_with_alpha_off_by_five_per_cent_are_rejected(bins):
     p = p_values(bins, seed=3, alpha_scale=1.05)
     assert p.min() < SIDAK
-    # More than half of the blends show the error, not only a few by chance.
+    # The test rejects more than half of the blends, so that the error is not found only by chance.
     assert np.mean(p < SIDAK) > 0.5
 
 

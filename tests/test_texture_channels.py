@@ -1,4 +1,4 @@
-"""A parameter of one number reads one channel of a coloured image. The user must choose the channel by name."""
+"""A scalar parameter reads one channel of a coloured image. The user must choose this channel by its name."""
 
 import mitsuba as mi
 import numpy as np

@@ -1,4 +1,4 @@
-"""Training starts at a plausible blend, repeats bit for bit, resumes after a kill, and reaches a known target.
+"""Training starts at a plausible blend, repeats bit for bit, resumes after a kill, and recovers a known target.
 
 The tests share few recipes, because JAX compiles each recipe anew.
 """
@@ -64,7 +64,7 @@ def test_a_run_repeats_bit_for_bit(tables):
 
 
 class Killed(Exception):
-    """Raised in place of the end of the process."""
+    """The exception that simulates the kill of a training process."""
 
 
 @pytest.mark.parametrize("moment", (150, pytest.param(50, marks=pytest.mark.slow)))
@@ -91,7 +91,7 @@ def test_a_killed_run_resumes_as_if_nothing_had_happened(tables, tmp_path, monke
     for a, b in zip(whole.layers, resumed.layers, strict=True):
         np.testing.assert_array_equal(a[0], b[0])
     assert [p.name for p in tmp_path.iterdir()] == ["run.ckpt"]
-    # Resuming the finished run does no further step.
+    # If a finished run is resumed, it does no more steps.
     _, done = training.train_class(LAYERED3, TINY, tables, {}, checkpoint=checkpoint)
     assert done.losses == expected.losses
 
@@ -143,7 +143,8 @@ def test_a_fit_approaches_its_table():
 def test_the_paper_s_preset_runs(tables):
     """The preset `paper` has the settings of the paper, and a training with it runs.
 
-    These are batches of 1000 bins, 20 uniform points per bin, raw inputs, and Adam with a learning rate of 1e-5.
+    The paper trains with batches of 1000 bins, 20 uniform points per bin, raw inputs, and Adam with a learning rate of
+    1e-5.
     """
     assert (PAPER.rows, PAPER.bins_per_row, PAPER.points) == (1000, 1, 20)
     assert (PAPER.points_law, PAPER.bins_law, PAPER.loss) == ("uniform", "uniform", "log")
@@ -153,7 +154,8 @@ def test_the_paper_s_preset_runs(tables):
     assert run.step == 4
     assert np.isfinite(run.losses).all()
     assert run.losses == run.log_losses
-    # This network maps 14 inputs to 23 outputs through 3x32. The paper's library has 33 inputs and 100 codes of 32.
+    # The adapter's network has 14 inputs, three hidden layers of 32 neurons, and 23 outputs. The paper's library has
+    # 33 inputs. Its 7159 parameters include 100 codes of 32 numbers.
     assert network.parameters(adapter.layers) == 7159 - 3200 - 19 * 32
 
 

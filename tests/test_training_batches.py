@@ -67,7 +67,8 @@ def test_a_batch_holds_the_values_of_the_tables(tables):
     )
     assert ((batch.mu * 40 >= batch.i - 1e-5) & (batch.mu * 40 <= batch.i + 1 + 1e-5)).all()
     assert ((batch.shift >= 0) & (batch.shift < 1)).all()
-    # The quantum is the contribution of one walk of throughput 1: 1 / (walks per row x solid angle of a bin), eq. 9.
+    # The quantum is the contribution of one walk of throughput 1 to a bin. By eq. 9 of the paper, it is
+    # 1 / (walks per row x solid angle of a bin).
     np.testing.assert_allclose(batch.quantum, 1.0 / (819_200 / 40 * ISOTROPIC.solid_angle), rtol=1e-6)
     assert all(x.dtype == np.float32 for x in batch)
     again = batch_of(tables, TINY, 3)
@@ -79,7 +80,8 @@ def test_a_batch_holds_the_values_of_the_tables(tables):
 def test_weights_undo_the_choice_of_anisotropic_bins():
     """Weighted means over drawn bins equal means over uniform bins also for anisotropic tables (Z-tests).
 
-    Rows of such tables depend on cosine and azimuth of `wi`. Half of the bins are drawn around the mirror direction.
+    A row of an anisotropic table belongs to a cosine and an azimuth of `wi`. Half of the bins are drawn around the
+    mirror direction.
     """
     grid, rng, n = Grid(theta_i=10, theta_o=20, phi_o=40, phi_i=20), np.random.default_rng(8), 20_000
     sampler = BinSampler("mirror", grid)
@@ -95,7 +97,10 @@ def test_weights_undo_the_choice_of_anisotropic_bins():
 
 
 def test_albedos_within_a_row_are_interpolated(tables):
-    """`albedo_at` is exact for albedos linear in the cosine. Its mean over a row equals that of the table."""
+    """`albedo_at` is exact for albedos that are linear in the cosine.
+
+    For any albedos, the mean of `albedo_at` over a row is the albedo of the row.
+    """
     pool = Pool.of(tables)
     rows, offsets = np.arange(40), (np.arange(8) + 0.5) / 8
     linear = replace(pool, albedo=np.tile((0.1 + (rows + 0.5) / 50)[None, :, None], (6, 1, 3)))

@@ -33,7 +33,7 @@ def interactions(n, cos_theta):
 def test_values_are_the_source_s_and_sampling_is_unbiased(file, cos_theta):
     """The values are those of the source, and the mean sample weight is the source's albedo, within 2 %.
 
-    The pdf integrates to the share of valid samples, within 3 %. A failure means biased pictures. Seeds are fixed.
+    The integral of the pdf is the share of valid samples, within 3 %. A failure means biased pictures. Seeds are fixed.
     """
     n, ctx = 400_000, mi.BSDFContext()
     bsdf, own = load_dict({"type": "values", "file": file}), mi.load_file(file)

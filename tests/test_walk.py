@@ -19,21 +19,22 @@ Float, PCG32 = dr.auto.Float, dr.auto.PCG32
 FALSE_ALARM = 1e-3
 WALKS = 1 << 18
 
-# A conductor that reflects all light, a coat without effect, and a conductor that reflects no light.
+# The parameters of a conductor that reflects all light, of a coat without effect, and of a conductor that reflects no
+# light.
 WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
 NO_COAT = {"eta_top": 1.0, "alpha_top": 1e-4}
 BLACK = {"eta_conductor": 1.0, "k_conductor": 0.0, "alpha_bottom": 1e-4}
-# Surfaces with microfacets this narrow are flat in single precision.
+# With a roughness of 1e-7, surfaces are flat in single precision.
 FLAT = {"alpha_top": 1e-7, "alpha_bottom": 1e-7}
 
 
 def lanes(value, n):
-    """The value in n lanes, opaque to the compiler, so that all materials share one kernel."""
+    """Returns an array of n equal values that is opaque to the compiler, so that all materials share one kernel."""
     return dr.opaque(Float, float(value)) + dr.zeros(Float, n)
 
 
 def albedo(mu, n=WALKS, seed=1, **values):
-    """The mean throughput (3,) of n walks from cos(theta_i) = mu, and its standard error (3,)."""
+    """Returns the mean throughput (3,) of n walks from cos(theta_i) = mu, and its standard error (3,)."""
     source = Layered3()
     columns = [lanes(c, n) for c in LAYERED3.vector({"albedo": 1.0, "sigma_t": 0.0, **values})]
     wi = Vec3(lanes(np.sqrt(1.0 - mu * mu), n), dr.zeros(Float, n), lanes(mu, n))
@@ -44,7 +45,7 @@ def albedo(mu, n=WALKS, seed=1, **values):
 
 
 def assert_equal_means(found, error, expected):
-    """Two-sided Z-tests of the numbers `found`, which have the standard errors `error`, against `expected`."""
+    """Compares estimates `found`, which have the standard errors `error`, with `expected` by two-sided Z-tests."""
     found, error, expected = np.broadcast_arrays(found, error, expected)
     z = np.abs(found - expected) / np.maximum(error, 1e-6)
     limit = norm.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / z.size)))
@@ -54,7 +55,10 @@ def assert_equal_means(found, error, expected):
 @pytest.mark.parametrize("eta_top", (1.05, 1.5, 2.0))
 @pytest.mark.parametrize("sigma_t", (0.0, 1.0, 3.0))
 def test_white_furnace_loses_nothing(eta_top, sigma_t):
-    """Nothing absorbs light, so the albedo is 1, however long walks are. Roulette may only end trapped walks."""
+    """If nothing absorbs light, the albedo is 1, even if walks are long.
+
+    So Russian roulette must not end walks, except for walks that are trapped.
+    """
     results = [
         albedo(mu, 1 << 16, eta_top=eta_top, sigma_t=sigma_t, **WHITE, **FLAT) for mu in (1.0, 0.3, 0.05)
     ]
@@ -62,7 +66,10 @@ def test_white_furnace_loses_nothing(eta_top, sigma_t):
 
 
 def test_perfect_mirror_under_smooth_coat_ends():
-    """A rare facet may tilt a grazing walk beyond the critical angle. The walk must still leave the coat or end."""
+    """A rare microfacet may reflect a grazing walk beyond the critical angle of the coat.
+
+    The walk must still leave the coat or end.
+    """
     found, _ = albedo(0.001, 1 << 15, eta_top=2.0, **WHITE, **FLAT)
     np.testing.assert_allclose(found, 1.0, atol=0.01)
 
@@ -74,7 +81,7 @@ def test_bare_rough_conductor():
     """
     known = {0.1: 0.98830, 0.3: 0.87736, 0.6: 0.59152, 1.0: 1.0 - np.log(2.0)}
     found, error = zip(*(albedo(1.0, alpha_bottom=a, **NO_COAT, **WHITE) for a in known), strict=True)
-    # The known albedos have five digits.
+    # The known albedos have five digits, so that half of the last digit is added to the error.
     assert_equal_means(found, np.array(error) + 0.5e-5 / 3.3, np.array(list(known.values()))[:, None])
 
 
@@ -110,11 +117,11 @@ def test_smooth_interfaces_without_medium(eta_top):
 
 
 def slab_albedo(mu, depth, rho, n=300):
-    """The reflectance (mus, rhos) of an isotropically scattering slab over black, from its collision density C.
+    """Returns the reflectance (mus, rhos) of an isotropically scattering slab over a black surface.
 
-    C(x) = exp(-x / mu) / mu + rho/2 int E1(|x - y|) C(y) dy. The reflectance is rho/2 int E2(x) C(x) dx (Chandrasekhar
-    1960, sections 11 and 58). The integrals use the midpoint rule, and the singularity of E1 is integrated in closed
-    form.
+    The density C of collisions solves C(x) = exp(-x / mu) / mu + rho/2 int E1(|x - y|) C(y) dy. The reflectance is
+    rho/2 int E2(x) C(x) dx (Chandrasekhar 1960, sections 11 and 58). E1 and E2 are exponential integrals. The integrals
+    over x and y use the midpoint rule, and the singularity of E1 is integrated in closed form.
     """
     x = (np.arange(n) + 0.5) * depth / n
     kernel = (
@@ -138,7 +145,10 @@ def test_slab_albedo_itself():
 
 
 def test_isotropic_slab_over_black():
-    """The medium alone. Its three channels have three different albedos."""
+    """Walks in the medium alone, without a coat and a reflecting conductor, have the albedo of `slab_albedo`.
+
+    The three colour channels of the medium have different single-scattering albedos.
+    """
     rho, mus = np.array([1.0, 0.9, 0.3]), np.array([1.0, 0.4, 0.1])
     for depth in (0.1, 1.0, 3.0):
         slab = {"sigma_t": depth, "albedo": rho, **NO_COAT, **BLACK}
@@ -147,7 +157,10 @@ def test_isotropic_slab_over_black():
 
 
 def test_rough_coat_over_white_conductor():
-    """The albedo is known to three digits. In this case, evaluation and walks of two public programs disagree."""
+    """The albedo of this material is .556, to three digits.
+
+    In two public programs, evaluation and random walks give different albedos for this material.
+    """
     found, error = albedo(0.9, 1 << 20, eta_top=1.5, alpha_top=0.2, alpha_bottom=0.4, **WHITE)
     assert_equal_means(found, error + 0.5e-3 / 3.3, 0.556)
 

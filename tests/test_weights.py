@@ -34,7 +34,10 @@ def parts(path):
 
 
 def refusal(path):
-    """Returns the message by which `Adapter.load` refuses a file. The message must be one line and name the file."""
+    """Returns the error message with which `Adapter.load` refuses a file.
+
+    Asserts that the message is one line and names the file.
+    """
     with pytest.raises(WeightsError) as caught:
         Adapter.load(path)
     message = str(caught.value)
@@ -63,7 +66,7 @@ def test_an_adapter_is_the_same_after_saving_and_loading(tmp_path, name, variant
 def test_stretched_targets_must_depend_on_the_direction(tmp_path):
     """A file with a stretched target that does not depend on the direction is refused.
 
-    Stretching lies in the plane of incidence, which the direction determines.
+    Lobes are stretched in the plane of incidence, which depends on the direction.
     """
     path = tmp_path / "a.safetensors"
     random_adapter(params=target.STRETCHED_PARAMS).save(path)
@@ -91,7 +94,8 @@ def test_the_file_describes_itself(path):
     }
     assert header["parameters"][-1]["valid_high"] == 1e3
     unbounded = ParamSpace("open", (replace(LAYERED3["sigma_t"], valid_high=float("inf")),))
-    assert weights.describe(unbounded)[0]["valid_high"] is None  # JSON has no infinity
+    # JSON has no infinity, so null means that there is no bound.
+    assert weights.describe(unbounded)[0]["valid_high"] is None
     assert header["hidden"] == [32, 32, 32]
     assert (header["instances"], header["directional"], header["reciprocal"]) == (2, True, False)
     assert header["dialect"] == "mitsuba-principled-reflection"

@@ -18,7 +18,7 @@ from nma.train.recipe import CLASS
 FALSE_ALARM = 1e-3
 TINY = replace(CLASS, network="2x8", rows=16, bins_per_row=4, points=4, steps=250, learning_rate=1e-2)
 
-# Training must recover this target: brass under a varnish, as two instances.
+# The blend that training must recover: brass under a varnish, as two instances.
 BRASS = Blend(
     (
         Principled(Color(0.9, 0.7, 0.4), 0.45, 1.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.5),
@@ -55,7 +55,7 @@ def constant_layers(blend, inputs=1, params=PRINCIPLED_PARAMS):
 def constant_adapter(blend, params=PRINCIPLED_PARAMS):
     """Returns an adapter whose network outputs `blend` for every input.
 
-    With `STRETCHED_PARAMS` the decoder still fades the stretching with the direction.
+    With `STRETCHED_PARAMS`, the decoder still reduces the stretching towards normal incidence.
     """
     layers, in_plane = constant_layers(blend, params=params), params is STRETCHED_PARAMS
     return Adapter(LAYERED3, "direction", layers, len(blend.instances), in_plane, params)
