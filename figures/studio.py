@@ -1,4 +1,4 @@
-"""Renders shader balls of unseen materials, in soft light that makes little noise."""
+"""Renders shader balls of unseen materials in soft light, so that the pictures have little noise."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from nma.render.lighting import LAMP_RADIANCE
 from nma.render.load import load_dict
 from nma.render.progressive import render_passes
 
-# The side of the soft box, relative to the side of the scene's lamp.
+# The side length of the soft box, relative to the side length of the scene's lamp.
 SOFT_BOX = 7
 
 
 def material(number: int, params: NDArray[np.float64]) -> Material:
-    """A validation material with its parameters (13,); `number` is its index in the set."""
+    """Returns a validation material from its parameters (13,) and its index in the set, `number`."""
     return Material.of_vector(f"validation-material-{number}", params, nma.LAYERED3)
 
 
 def describe(material: Material) -> str:
-    """One line with the material's widths, index of refraction and optical depth."""
+    """Returns a line with the material's roughness (alpha), the coat's index of refraction, and the extinction."""
     short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
     return short.format(material.title, **material.values)
 
 
 def worst_to_median(errors: ArrayLike, count: int) -> NDArray[np.intp]:
-    """Indices at even steps from the largest error to the median: `count` of them, or fewer if there are too few."""
+    """Returns `count` indices (or fewer if there are few errors) at even steps from the largest error to the median."""
     worst_first = np.argsort(errors)[::-1]
     return worst_first[np.unique(np.linspace(0, len(worst_first) // 2, count).astype(int))]
 
@@ -37,14 +37,14 @@ def worst_to_median(errors: ArrayLike, count: int) -> NDArray[np.intp]:
 def render(
     bsdf: dict[str, Any], size: int, spp: int, seed: int, sampler: str = "independent"
 ) -> NDArray[np.float32]:
-    """A picture (size, size, 3) of the ball with this BSDF."""
+    """Renders a picture (size, size, 3) of the shader ball with the BSDF `bsdf`."""
     return render_passes(load_dict(scene(bsdf, size, sampler)), spp, seed=seed)
 
 
 def scene(bsdf: dict[str, Any], size: int, sampler: str = "independent") -> dict[str, Any]:
-    """The preview scene under a sky without a sun, with a soft box in place of the lamp and one bounce of light.
+    """Returns the preview scene with a sky but no sun, a soft box in place of the lamp, and one bounce of light.
 
-    Small lights and caustics would make noise, and this noise would hide the differences between adapters.
+    Small lights and caustics would cause noise, which would hide the differences between adapters.
     """
     made = nma.preview_scene(bsdf, size=(size, size), lighting="outdoors", hide_sun=True, max_depth=3)
     made["sensor"]["sampler"]["type"] = sampler

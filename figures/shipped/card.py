@@ -1,4 +1,4 @@
-"""Writes the model cards of the shipped adapters: what they are, how good they are, and where they fail."""
+"""Writes the model cards of the shipped adapters, with training, accuracy, worst materials and known limits."""
 
 from __future__ import annotations
 
@@ -21,22 +21,23 @@ from nma.render.progressive import render_passes
 
 WORST = 10
 LIMITS = """\
-- The adapter knows only the class `layered3` within its training range. It refuses other parameters, or clamps them to
-  the range on request.
-- The target follows the view direction, so it is not reciprocal. Light tracing and bidirectional methods converge to
-  another picture, unless they [prepare the blend for the camera's side](../../docs/mitsuba.md#reciprocity).
-- Reflection is isotropic, and its lobes have the shapes of the Principled BRDF. The worst materials show the errors
-  that this causes.
+- The adapter was trained for the class `layered3` within the ranges of its training data. It rejects parameters outside
+  these ranges, or clamps them to the ranges on request.
+- The target's parameters depend on the view direction, so the BRDF is not reciprocal. Light tracing and bidirectional
+  methods converge to a picture that differs from path tracing, unless they
+  [prepare the blend for the camera's side](../../docs/mitsuba.md#reciprocity).
+- The reflection is isotropic, and its lobes have the shapes of the Principled BRDF. Where a material's lobes have other
+  shapes, the adapter has errors, which the worst materials above show.
 """
 
 
 def write(weights: str, sets: dict[str, tuple[nma.Tables, dict]], folder: Path, quick: bool) -> Path:
-    """Writes the card of one adapter with its pictures, and returns the card's path.
+    """Writes the model card of one adapter with its pictures, and returns the card's path.
 
     Args:
         weights: a weights file or a shipped name.
-        sets: the reference tables and the results of each set, by name.
-        quick: whether to render few small pictures.
+        sets: the reference tables and the results of each set of materials, by the set's name.
+        quick: whether to render fewer pictures, with fewer samples per pixel.
     """
     adapter, name = nma.Adapter.load(weights), Path(weights).stem
     _histogram(sets, folder / f"{name}-errors.png")
@@ -52,18 +53,18 @@ def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dic
     bound = "bounded" if adapter.bounded else "not bounded"
     return f"""# {name}
 
-Written by `python -m figures.shipped.run`. This is an adapter for the class `{adapter.space.name}`. Its target is
-{adapter.variant}; its energy is {bound}. Its network is {recipe["network"]} with {count:,} parameters, encoding
-`{adapter.encoding}`.
+`python -m figures.shipped.run` writes this page. This is an adapter for the class `{adapter.space.name}`. Its target is
+*{adapter.variant}*, whose albedo is {bound}. Its network has the size {recipe["network"]},
+{count:,} parameters, and the input encoding `{adapter.encoding}`.
 
 ## Training
-The dataset has {data["materials"]:,} materials of the population `{data["population"]}`, with {data["walks"]:,} walks
-each (seed {data["seed"]}). Training took {record["steps"]:,} steps over {record["bins_seen"]:,} bins, or
-{record["seconds"] / 60:.0f} minutes on {record["device"]} ({record["date"]}).
+The dataset has {data["materials"]:,} materials of the population `{data["population"]}` (seed {data["seed"]}), with
+{data["walks"]:,} walks per material. Training took {record["steps"]:,} steps with {record["bins_seen"]:,} bins in all,
+and {record["seconds"] / 60:.0f} minutes on {record["device"]} ({record["date"]}).
 [docs/training.md](../../docs/training.md) has the commands, and `nma info {name}` prints every setting.
 
-## Figures on materials it has not seen
-[docs/evaluation.md](../../docs/evaluation.md) explains the figures. In the set `metals`, every third material has a
+## Metrics on unseen materials
+[docs/evaluation.md](../../docs/evaluation.md) explains the metrics. In the set `metals`, every third material has a
 metal that was held out of training.
 
 {_table(sets)}
@@ -80,8 +81,8 @@ metal that was held out of training.
 
 
 def _table(sets: dict[str, tuple[nma.Tables, dict]]) -> str:
-    """A table with a column for each set: first the mean figures, then the worst figures."""
-    rows = [("figure", *(f"{label}, {len(tables.params)}" for label, (tables, _) in sets.items()))]
+    """Returns a table with a column for each set of materials: first the mean metrics, then the largest errors."""
+    rows = [("metric", *(f"{label}, {len(tables.params)}" for label, (tables, _) in sets.items()))]
     rows.append(("---",) * len(rows[0]))
     rows += [
         (figure, *(f"{result['mean'][figure]:.4g}" for _, result in sets.values())) for figure in FIGURES
@@ -105,7 +106,7 @@ def _histogram(sets: dict[str, tuple[nma.Tables, dict]], path: Path) -> None:
 
 
 def _worst(weights: str, sets: dict[str, tuple[nma.Tables, dict]], path: Path, quick: bool) -> list[str]:
-    """Renders the materials with the largest log losses, and returns a line about each of them."""
+    """Renders the materials with the largest log losses, and returns a line of text about each of these materials."""
     nma.render.use()
     ranked = [
         (loss, label, k) for label, (_, result) in sets.items() for k, loss in enumerate(result["log_loss"])

@@ -1,11 +1,13 @@
-"""The shipped adapters on materials that training has not seen: 89 from Table 1's ranges, and 60 with real metals.
+"""Accuracy of the shipped adapters on unseen materials: 89 from Table 1's ranges, and 60 with real metals.
 
     python -m figures.shipped.run [--quick] [--adapter FILE ...]
 
-Every third of the 60 has a metal that training never saw. The references have 64 M walks per material. They are
-simulated once, from fixed seeds, into out/references (about 15 minutes on 2 cores; a killed run resumes). Writes
-shipped.json, shipped.png and a model card for each adapter beside this file; with --quick, few materials and walks, to
-out/figures/shipped.
+Every third of the 60 materials has a metal that was held out of training. The references have 64 M walks per material
+and fixed seeds. They are simulated only once and stored in out/references (about 15 minutes on 2 cores; a killed
+simulation can be resumed).
+
+Writes shipped.json, shipped.png and a model card for each adapter beside this file. With --quick, takes few materials
+and walks, and writes to out/figures/shipped.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ def main() -> None:
 
 
 def summary(evaluation, tables) -> dict:
-    """The mean figures, the figures of sharp coats, the worst figures, and both main figures of every material."""
+    """Returns mean metrics and largest errors, and the log loss and albedo error of every material."""
     rounded = {k: round(v, 6) for k, v in evaluation.mean.items()}
     errors = np.array([m["albedo_error"] for m in evaluation.materials])
     sharp = tables.params[:, nma.LAYERED3.slices["alpha_top"]][:, 0] < 0.01
@@ -59,7 +61,7 @@ def summary(evaluation, tables) -> dict:
 
 
 def plot(results: dict, path: Path) -> None:
-    """Draws the sorted log losses and albedo errors of all materials, one curve for each adapter and set."""
+    """Plots the sorted log losses and albedo errors of all materials, with a curve for each adapter and set."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots(1, 2)
     for label, sets in results.items():

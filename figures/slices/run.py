@@ -1,9 +1,13 @@
-"""BSDF slices of six unseen materials and of their adapter, at 70 degrees and at normal incidence (paper Fig. 10).
+"""BRDF slices of six unseen materials, simulated and by the adapter, at two angles of incidence (paper Fig. 10).
 
     python -m figures.slices.run [--quick] [--adapter FILE]
 
-The materials are from the reference set "range", evenly spaced by the roughness of their coats, from sharp to rough.
-Writes slices.json and slices.png beside this file; with --quick, four materials with few walks, to out/figures/slices.
+A slice shows f cos(theta_o) for all directions wo, at 70 degrees or at normal incidence. The materials are taken from
+the set "range" (figures/common.py): the set is sorted by the roughness of the coat, and materials at even steps are
+chosen.
+
+Writes slices.json and slices.png beside this file. With --quick, takes four materials with few walks, and writes to
+out/figures/slices.
 """
 
 from __future__ import annotations
@@ -20,11 +24,11 @@ from figures import common
 from nma.images.io import tonemap
 
 MATERIALS = 6
-ANGLES = (70, 0)  # of wi, in degrees
+ANGLES = (70, 0)  # angles of incidence, in degrees
 PIXELS = 256
-# A value f is shown as y / (1 + y), with y = EXPOSURE f.
+# A value v [1/sr] is displayed as y / (1 + y), where y = EXPOSURE v.
 EXPOSURE = 3.0
-# The absolute error [1/sr] that gets the last colour of the scale.
+# The absolute error [1/sr] at the upper end of the colour scale.
 ERROR_SCALE = 0.5
 
 
@@ -41,7 +45,7 @@ def main() -> None:
 
 
 def chosen(tables: nma.Tables) -> nma.Tables:
-    """Chooses materials, evenly spaced by the roughness of their coats. The choice does not depend on results."""
+    """Chooses materials at even steps, in the order of the roughness of their coats."""
     order = np.argsort(tables.params[:, nma.LAYERED3.slices["alpha_top"]][:, 0])
     count = min(MATERIALS, len(order))
     picked = order[((np.arange(count) + 0.5) / count * len(order)).astype(int)]
@@ -49,7 +53,7 @@ def chosen(tables: nma.Tables) -> nma.Tables:
 
 
 def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
-    """For each slice [1/sr]: the mean absolute error, the mean value, and the error that noise alone would make."""
+    """Returns for each slice [1/sr]: mean absolute error, mean value, and the error that noise alone gives."""
     slices = []
     for m, params in enumerate(tables.params):
         entry: dict = {"params": [round(float(x), 5) for x in params]}
@@ -61,7 +65,7 @@ def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
                 "mean": reference.mean(),
             }
             if tables.error is not None:
-                # The mean of |e| for a normally distributed e.
+                # A normally distributed e with standard deviation s has a mean |e| of sqrt(2 / pi) s.
                 figures["of_noise_alone"] = np.sqrt(2 / np.pi) * tables.error[at].mean(dtype=np.float64)
             entry[f"{angle} degrees"] = {name: round(float(x), 6) for name, x in figures.items()}
         slices.append(entry)
@@ -75,18 +79,18 @@ def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
 
 
 def disc(values: NDArray, outside: float = 1.0) -> NDArray[np.float32]:
-    """Draws the hemisphere of wo from above, with wi to the left and its mirror direction to the right.
+    """Draws the hemisphere of wo from above, with wi to the left and the mirror direction to the right.
 
-    The projection is Lambert's: all bins have equal areas on the disc, as on the hemisphere.
+    The projection is Lambert's equal-area projection: all bins have equal areas on the disc, as on the hemisphere.
 
     Args:
-        values: (theta_o, phi, channels).
-        outside: the value of pixels beside the disc.
+        values: bin averages (theta_o, phi, channels).
+        outside: the value of pixels outside the disc.
 
     Returns:
         a picture (PIXELS, PIXELS, channels).
     """
-    # Each pixel is the average of 2 x 2 samples, which makes the rim smooth.
+    # Each pixel is the average of 2 x 2 samples, which makes the disc's edge smooth.
     axis = (np.arange(2 * PIXELS) + 0.5) / PIXELS - 1.0
     x, y = np.meshgrid(axis, axis)
     cosine = 1.0 - x * x - y * y
@@ -99,7 +103,7 @@ def disc(values: NDArray, outside: float = 1.0) -> NDArray[np.float32]:
 
 
 def plot(tables: nma.Tables, adapter: NDArray, label: str, path: Path) -> None:
-    """Draws a column for each material. Each angle has three rows: reference, adapter and absolute error."""
+    """Draws a column for each material, and three rows for each angle: reference, adapter and absolute error."""
     count = len(tables.params)
     figure = Figure(figsize=(1.5 * count + 1.3, 9.6), layout="constrained")
     axes = figure.subplots(3 * len(ANGLES), count, squeeze=False)

@@ -1,12 +1,14 @@
-"""Paper Fig. 5: fits that learn from the centre of a bin, from 1 to 20 uniform points in it, and from crowded points.
+"""Paper Fig. 5: fits with different points in a bin (the centre, 1 to 20 uniform points, or 8 crowded points).
 
     python -m figures.supervision.run [--quick]
 
-Training compares a bin's value with the target at one or more points in the bin. Here a 3x32 network, which sees only
-the view direction, is fitted to a smooth conductor and to a layered material. All fits use the paper's loss and target
-and the same table, steps and learning rate; only the points differ. The last column also has the other settings of
-`nma fit`. Every fit is compared with an independent table and rendered. Writes supervision.json and supervision.png
-beside this file; with --quick, three short fits, to out/figures/supervision.
+Training compares the bin's value in a table with the mean of the target over one or more points in the bin. Here a 3x32
+network, whose only input is the view direction, is fitted to a smooth conductor and to a layered material. All fits use
+the paper's loss and target and the same table, steps and learning rate; only the points differ. The fit in the last
+column uses all settings of `nma fit`. Every fit is compared with an independent table and rendered.
+
+Writes supervision.json and supervision.png beside this file. With --quick, makes three short fits and writes to
+out/figures/supervision.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from nma.table import stream_keys
 from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
-# The paper's conductor is bare. Materials of our class have a coat, so ours is smooth and has an index close to 1.
+# The paper's conductor has no coat. Materials of our class always have a coat, so ours is given a smooth coat whose
+# index of refraction is close to 1.
 BARE = {"alpha_top": 0.001, "alpha_bottom": 0.01, "eta_top": 1.05, "albedo": 1.0, "sigma_t": 0.0}
 LAYERED = "gold-red-lacquer"
 PAPER = {"loss": "log", "energy": 0.0, "albedo": 0.0, "target": "principled", "bins_law": "uniform"}
@@ -37,7 +40,7 @@ REFERENCE_KEY = 999
 
 
 class Effort(NamedTuple):
-    """The sizes of the experiment: steps, walks, pixels on a side and samples per pixel."""
+    """The effort of the experiment: training steps, walks, size of the pictures in pixels, and samples per pixel."""
 
     steps: int = 3000
     walks: int = 32_000_000
@@ -67,7 +70,7 @@ def main() -> None:
 
 
 def recipes(steps: int, quick: bool) -> dict[str, Recipe]:
-    """The recipe of each column of the picture, by name."""
+    """Returns the recipe of each column of the picture sheet, by name."""
     equal = {"steps": steps, "schedule": "onecycle"}
     laws = {"centre": preset("single", **PAPER, **equal, points_law="centre", points=1)}
     for points in (8,) if quick else (1, 2, 4, 8, 20):
@@ -79,7 +82,7 @@ def recipes(steps: int, quick: bool) -> dict[str, Recipe]:
 
 
 def materials() -> list[Material]:
-    """The smooth conductor, and the layered material."""
+    """Returns the smooth conductor and the layered material."""
     layered = nma.load_material(LAYERED)
     smooth = layered.changed(BARE | {"conductor": "Au"})
     title = f"Gold of alpha {BARE['alpha_bottom']} under a coat that hardly shows"
@@ -87,7 +90,7 @@ def materials() -> list[Material]:
 
 
 def compare(material: Material, laws: dict[str, Recipe], effort: Effort) -> tuple[dict[str, dict], Row]:
-    """Fits one material with each recipe; returns the figures of each fit and a row of pictures."""
+    """Fits one material with each recipe. Returns the metrics of each fit, and a row of the picture sheet."""
     source, params = nma.source(material.class_name), material.vector()[None]
     tables = nma.tabulate(source, params, effort.walks, stream_keys(0, [0]), error=False)
     truth = nma.tabulate(source, params, effort.reference_walks, stream_keys(REFERENCE_KEY, [0]))
@@ -111,7 +114,7 @@ def compare(material: Material, laws: dict[str, Recipe], effort: Effort) -> tupl
 
 
 def render_adapter(material: Material, adapter: nma.Adapter, effort: Effort) -> NDArray[np.float32]:
-    """Renders the shader ball with the BSDF `nma`. The BSDF reads its weights from a file, so they are saved first."""
+    """Renders the shader ball with the BSDF `nma`, which reads the adapter from a temporary file."""
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "fit.safetensors"
         adapter.save(path)
@@ -119,7 +122,7 @@ def render_adapter(material: Material, adapter: nma.Adapter, effort: Effort) -> 
 
 
 def render(bsdf: dict, effort: Effort, spp: int) -> NDArray[np.float32]:
-    """Renders the preview scene, outdoors, with this BSDF; returns a picture (size, size, 3)."""
+    """Renders a picture (size, size, 3) of the preview scene outdoors with the BSDF `bsdf`."""
     scene = nma.preview_scene(bsdf, size=(effort.size, effort.size), lighting="outdoors")
     return render_passes(load_dict(scene), spp)
 
@@ -129,7 +132,7 @@ def caption(figures: dict[str, float]) -> str:
 
 
 def note(effort: Effort) -> str:
-    """A note below the pictures about how they were made."""
+    """Returns the note below the pictures, which says how the pictures were made."""
     return (
         f"Every fit: {effort.steps} steps on one table of {effort.walks / 1e6:.0f} M walks. Log loss and albedo error "
         f"against another table of {effort.reference_walks / 1e6:.0f} M walks.\n"

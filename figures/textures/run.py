@@ -1,12 +1,13 @@
-"""Textures without training for them: roughness, then extinction, then albedo come from textures (paper Fig. 7).
+"""Textured materials, rendered with an adapter that was not trained on textures (paper Fig. 7).
 
     python -m figures.textures.run [--quick] [--adapter FILE]
 
-The simulation and the adapter render the preview scene with one material: (a) without textures, (b) with a texture for
-the metal's roughness, (c) also with one for the extinction, (d) also with one for the albedo of the medium. The
-simulation is rendered again with as many samples as the adapter; the error of this picture is noise only. Writes
-textures.json and textures.png beside this file; with --quick, only (a) and (d), in small pictures of few samples, to
-out/figures/textures.
+The preview scene with one material is rendered by simulation and with the adapter: (a) without textures, (b) with a
+texture for the metal's roughness, (c) with a second texture for the extinction, (d) with a third texture for the albedo
+of the medium. A second simulation has as many samples per pixel as the adapter; the error of its picture is only noise.
+
+Writes textures.json and textures.png beside this file. With --quick, renders only (a) and (d) in small pictures with
+few samples, and writes to out/figures/textures.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ TABLED = ("flip_hdr", "flip_ldr", "smape", "ssim")
 
 
 class Size(NamedTuple):
-    """Pixels on a side, samples per pixel of the reference, and samples per pixel of the other pictures."""
+    """Size of the pictures in pixels, and samples per pixel of the reference and of the other two pictures."""
 
     pixels: int
     reference_spp: int
@@ -48,7 +49,7 @@ class Size(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Pictures of the reference and the adapter; the adapter's metrics, and the metrics of the reference's noise."""
+    """Pictures of the reference and the adapter, the adapter's metrics, and the metrics of the second simulation."""
 
     reference: np.ndarray
     adapter: np.ndarray
@@ -79,8 +80,8 @@ def main() -> None:
 
 
 def render(textures: dict[str, Any], adapter: str, size: Size) -> Step:
-    """Renders the material with these textures: the reference, the simulation again, and the adapter. The three
-    pictures have independent samples."""
+    """Renders the material with the textures `textures` three times: the reference, a second simulation, and the
+    adapter. The three pictures have independent samples."""
     material = nma.load_material(MATERIAL).changed(CHANGES)
     layered, ours = (
         load_dict(
@@ -114,7 +115,7 @@ def summary(steps: dict[str, Step], adapter: str, size: Size) -> dict:
 
 
 def plot(steps: dict[str, Step], adapter: str, size: Size, path: Path) -> None:
-    """Draws one column for each step: the reference, the adapter and their FLIP. A table below has the metrics."""
+    """Draws a column for each step (reference, adapter, and the FLIP between them), with a table of metrics below."""
     made = list(steps.values())
     differences = [difference_image(s.adapter, s.reference, kind="flip", scale=FLIP_SCALE) for s in made]
     rows = [

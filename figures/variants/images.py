@@ -1,4 +1,4 @@
-"""Renders shader balls of the validation materials, keeps the pictures, and compares them with the simulation."""
+"""Renders shader balls of the validation materials, stores the pictures, and compares adapters with the simulation."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ from nma.materials import Material
 from nma.render.load import material_bsdf
 
 Images = NDArray[np.float32]
-# Seeds of the reference, of a second simulation that shows what noise alone scores, and of the adapters.
+# Seeds of the reference, of a second simulation (for the metrics of noise alone), and of the adapters.
 REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
 
 
 class View(NamedTuple):
-    """How materials are rendered: the first `materials` of the validation set, with `size` x `size` pixels, `spp`
-    samples per pixel for adapters and `reference_spp` for the simulation."""
+    """How the first `materials` materials of the validation set are rendered.
+
+    Pictures have `size` x `size` pixels, with `spp` samples per pixel for adapters and `reference_spp` for the
+    simulation.
+    """
 
     materials: int = 89
     size: int = 128
@@ -33,8 +36,8 @@ class View(NamedTuple):
 
 
 class Gallery:
-    """Renders pictures (materials, height, width, 3) of the reference and of adapters, and keeps them in the store's
-    folder."""
+    """Renders pictures (materials, height, width, 3) of the reference and of adapters, and stores the pictures in the
+    store's folder."""
 
     def __init__(self, store: Store, view: View, validation: str):
         self._store, self._view, self._validation = store, view, validation
@@ -43,19 +46,21 @@ class Gallery:
         self.reference = self._simulated(view.reference_spp, REFERENCE_SEED)
 
     def noise(self) -> dict[str, float]:
-        """The metrics of a second simulation with the adapters' samples per pixel. They come from noise alone, so no
-        adapter can be expected to be better."""
+        """Returns the metrics of a second simulation, with as many samples per pixel as the adapters.
+
+        The second simulation differs from the reference only by noise, so its metrics show the effect of noise alone.
+        """
         return compare(self._simulated(self._view.spp, NOISE_SEED), self.reference)
 
     def metrics(self, job: Job, adapter: nma.Adapter) -> dict[str, float]:
-        """The image metrics of an adapter, averaged over the materials."""
+        """Returns the image metrics of an adapter, averaged over the materials."""
         settings = {"view": self._view._asdict(), "validation": self._validation}
         return self._store.cached(
             job, "images", settings, adapter, lambda: compare(self.pictures(job, adapter), self.reference)
         )
 
     def pictures(self, job: Job, adapter: nma.Adapter) -> Images:
-        """The adapter's pictures. They are rendered again if the weights are newer than the pictures."""
+        """Returns the adapter's pictures, which are rendered again if the weights are newer than the pictures."""
         weights = self._store.weights(job)
 
         def bsdf(material: Material) -> dict[str, Any]:
@@ -64,7 +69,7 @@ class Gallery:
         return self._kept(job.stem, bsdf, self._view.spp, ADAPTER_SEED, newer_than=weights)
 
     def shipped(self, name: str) -> dict[str, float]:
-        """The image metrics of a shipped adapter. It was trained on the same data for many more steps."""
+        """Returns the image metrics of a shipped adapter, averaged over the materials."""
         pictures = self._kept(
             name, lambda m: material_bsdf(m, "nma", adapter=name), self._view.spp, ADAPTER_SEED
         )
@@ -93,13 +98,13 @@ class Gallery:
 
 
 def compare(pictures: Images, references: Images) -> dict[str, float]:
-    """All image metrics, averaged over the materials."""
+    """Returns all image metrics, averaged over the materials."""
     found = [nma.compare_images(a, b) for a, b in zip(pictures, references, strict=True)]
     return {name: round(float(np.mean([f[name] for f in found])), 7) for name in METRICS}
 
 
 def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int = 4) -> None:
-    """Writes a sheet like the paper's Fig. 6: materials from the worst to the median by the first variant's error."""
+    """Writes a sheet like the paper's Fig. 6: materials from the largest to the median error of the first variant."""
     flips = {
         name: [nma.compare_images(a, b)["flip_ldr"] for a, b in zip(images, gallery.reference, strict=True)]
         for name, images in pictures.items()

@@ -1,4 +1,4 @@
-"""The paper's results, for comparison with ours: Table 2 (89 materials) and Table 3 (92 materials)."""
+"""The results of the paper's Table 2 (89 materials) and Table 3 (92 materials), for comparison with our results."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from nma.images.metrics import METRICS
 
 
 def _rows(text: str) -> dict[str, dict[str, float]]:
-    """Parses lines of the form `name: number ...`; the numbers are in the order of `METRICS`."""
+    """Parses lines of the form `name: value ...`, with one value for each metric, in the order of `METRICS`."""
     lines = (line.split(":") for line in text.strip().splitlines())
     return {
         name.strip(): dict(zip(METRICS, map(float, numbers.split()), strict=True)) for name, numbers in lines
     }
 
 
-# MAPE and SMAPE are in percent, as in the paper. The paper has no row for five instances.
+# MAPE and SMAPE are in percent, as in the paper. The paper's Table 3 has no row for five instances.
 TABLE_2 = _rows("""
     single:            .0055 .0003 2.6285 2.5006 .0124 .9954 .0484 .0387
     omega_i:           .0051 .0002 2.5037 2.3927 .0106 .9961 .0453 .0367

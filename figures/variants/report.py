@@ -1,4 +1,4 @@
-"""The results of all trainings: means and deviations over seeds, orderings, Markdown tables and the plot of Fig. 3."""
+"""Report of all trainings: means and deviations over seeds, ordering of the variants, tables, and plot of Fig. 3."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from nma.images.metrics import METRICS
 
 Results = dict[Job, dict[str, Any]]
 WORST, BEST = "single", "blended + omega_i"
-# The rows of Table 3, by variant.
+# The names of the rows of Table 3, by variant.
 ROWS_3 = {"omega_i": "1 instance", BEST: "2 instances"} | {name: name for name in INSTANCES}
 
 
 def statistics(values: list[float]) -> dict[str, Any]:
-    """The mean, the standard deviation (None for a single seed) and the number of seeds."""
+    """Returns mean, standard deviation (None for a single seed) and number of seeds."""
     deviation = round(float(np.std(values, ddof=1)), 7) if len(values) > 1 else None
     return {"mean": round(float(np.mean(values)), 7), "std": deviation, "seeds": len(values)}
 
 
 def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
-    """All results that the tables show: log losses by variant and size, orderings, and image metrics by variant."""
+    """Returns the tables' results: log losses by variant and dataset size, orderings, and image metrics by variant."""
     losses: dict[str, dict[str, Any]] = {}
     for name in [*VARIANTS, *INSTANCES]:
         for size in [*sizes, 0]:
@@ -45,7 +45,10 @@ def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
 
 
 def orderings(results: Results, sizes: list[int]) -> dict[str, dict[str, list[bool]]]:
-    """For each figure: whether single is worst and blended + omega_i is best, for each seed that has all variants."""
+    """Returns whether `single` is worst and `blended + omega_i` is best, by metric and dataset size.
+
+    Each list has an entry for each seed with which all variants were trained.
+    """
     found: dict[str, dict[str, list[bool]]] = {}
     for size in sizes:
         for seed in sorted({job.seed for job in results}):
@@ -66,18 +69,18 @@ def orderings(results: Results, sizes: list[int]) -> dict[str, dict[str, list[bo
 
 
 def _errors(runs: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """The error of each variant, by figure: the log loss, and the image metrics if all variants have them."""
+    """Returns the errors of each variant, by metric: log loss, and the image metrics if all variants have images."""
     found = {"log loss": {name: run["tables"]["log_loss"] for name, run in runs.items()}}
     if all("images" in run for run in runs.values()):
         for metric in METRICS:
-            # SSIM is a similarity: a high value is good, so its sign is changed.
+            # A high SSIM is good, so its sign is changed to turn it into an error.
             sign = -1.0 if metric == "ssim" else 1.0
             found[metric] = {name: sign * run["images"][metric] for name, run in runs.items()}
     return found
 
 
 def markdown(found: dict[str, Any], noise: dict[str, float], floor: float) -> str:
-    """All tables, in Markdown, with headings."""
+    """Returns all tables with headings, in Markdown."""
     parts = ["## Log loss (Fig. 3)", loss_table(found["log_loss"]), f"Noise of the references: {floor:.5f}."]
     parts += ["## Ordering", ordering_lines(found["ordering"])]
     for title, names, paper in (
@@ -97,7 +100,7 @@ def loss_table(losses: dict[str, dict[str, Any]]) -> str:
 
 
 def ordering_lines(found: dict[str, dict[str, list[bool]]]) -> str:
-    """A table that says for how many seeds the paper's ordering holds."""
+    """Returns a table of the numbers of seeds for which the paper's ordering of the variants holds."""
     if not found:
         return "No dataset size has results of all variants yet."
     lines = [["", *next(iter(found.values()))]]
@@ -106,15 +109,19 @@ def ordering_lines(found: dict[str, dict[str, list[bool]]]) -> str:
     losses = [
         holds for figure, row in found.items() if figure.startswith("log loss") for holds in row.values()
     ]
-    answer = "yes" if all(map(all, losses)) else "no"
-    return table(lines) + f"\n\nThe paper's ordering by log loss holds for every seed and size: {answer}."
+    answer = "Yes" if all(map(all, losses)) else "No"
+    question = "Does the paper's ordering hold for the log loss of every seed and dataset size?"
+    return table(lines) + f"\n\n{question} {answer}."
 
 
 def image_table(
     images: dict[str, Any], names: dict[str, str], paper: dict[str, dict[str, float]], noise: dict[str, float]
 ) -> str:
-    """A table of image metrics: for each variant our row and the paper's, and last the noise of the renderings. MAPE
-    and SMAPE are in percent."""
+    """Returns a table of image metrics, with MAPE and SMAPE in percent.
+
+    Each variant has a row with our results and a row with the paper's results. The last row shows the metrics of noise
+    alone.
+    """
     lines = [["", *(f"{m}, %" if m in PERCENT else m for m in METRICS)]]
     for variant, label in names.items():
         if variant in images:
@@ -140,7 +147,7 @@ def table(lines: list[list[str]]) -> str:
 
 
 def plot(losses: dict[str, dict[str, Any]], floor: float, path: Path) -> None:
-    """Draws the paper's Fig. 3: log loss over the dataset's size. Dashed lines show the bounds by overfitting."""
+    """Plots log loss against the dataset's size (Fig. 3). Dashed lines show adapters trained on the validation set."""
     figure = Figure(figsize=(8.5, 4.5), layout="constrained")
     axes = figure.add_subplot(xlabel="materials in the training set", ylabel="validation log loss (eq. 7)")
     sizes: list[int] = []

@@ -1,13 +1,16 @@
-"""Paper Fig. 3, Table 2, Fig. 6 and Table 3: variants of the target, over the size of the dataset and in pictures.
+"""Variants of the target: log loss by the size of the dataset, and pictures (paper Fig. 3, Table 2, Fig. 6, Table 3).
 
     python -m figures.variants.run [--quick] [--data FOLDER.zarr] [--sizes N ...] [--seeds N] [--steps N]
         [--only VARIANT ...] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
 
-Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md). As a bound, it also
-trains every variant on the validation set itself. This takes hours. Adapters, their figures and their pictures are kept
-in out/figures/variants, so a killed run continues where it stopped, and nothing is done twice. --only limits the
-training to some variants; the report contains all adapters that exist. Writes variants.json, tables.md, variants.png
-and materials.png beside this file; with --quick, of a few small trainings, to out/figures/variants.
+Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md), for several numbers of
+materials. Also trains every variant on the validation set, which gives a lower bound of the validation error. All
+trainings together take hours. The adapters, their metrics and their pictures are kept in out/figures/variants, so a
+killed run continues where it stopped, and nothing is computed twice. With --only, only the named variants are trained;
+the report still contains all adapters that exist.
+
+Writes variants.json, tables.md, variants.png and materials.png beside this file. With --quick, makes a few small
+trainings and writes to out/figures/variants.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from nma.files import write_text
 
 SET = "range"
 SETTINGS = ("sizes", "seeds", "steps", "materials", "resolution", "spp", "reference_spp")
-# Settings of --quick: materials and walks of its dataset, validation materials, and values for the other options.
+# Settings of --quick: materials and walks of the dataset, number of validation materials, and values of other options.
 QUICK_DATA = (16, 100_000)
 QUICK_VALIDATION = 2
 QUICK = {"sizes": [16], "seeds": 1, "steps": 20, "materials": 2, "resolution": 160, "spp": 8}
@@ -42,7 +45,7 @@ def main() -> None:
     data = quick_dataset(kept / "data.zarr") if quick else arguments.data
     validation = common.reference(SET, quick)
     if quick:
-        # Optimised compilation takes longer than these few steps.
+        # With so few steps, optimised compilation would take longer than the training.
         jax.config.update("jax_disable_most_optimizations", True)
         validation = validation[:QUICK_VALIDATION]
     name = f"{SET}-{len(validation.params)}x{int(validation.walks[0])}"
@@ -93,7 +96,7 @@ def parse() -> argparse.Namespace:
 
 
 def quick_dataset(path: Path) -> Path:
-    """Simulates a small dataset unless it exists, and returns its path."""
+    """Simulates a small dataset unless its folder exists, and returns the path."""
     materials, walks = QUICK_DATA
     nma.Dataset.create(path, nma.Settings("layered3", materials, walks, seed=2)).write()
     return path
@@ -106,7 +109,7 @@ def write(
     arguments: argparse.Namespace,
     done: dict[Job, nma.Adapter],
 ) -> None:
-    """Prints the tables, and writes tables, figures, plot and pictures."""
+    """Prints the tables, and writes tables, metrics, plot and pictures."""
     floor = next(iter(results.values()))["tables"]["noise_floor"]
     noise = gallery.noise()
     found = report.summary(results, arguments.sizes)

@@ -1,4 +1,4 @@
-"""Plans and runs the trainings of all variants. Each training runs once; its weights and figures are kept."""
+"""Plans and runs the trainings of all variants. Each training runs once; its weights and metrics are kept."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nma.files import write_text
 from nma.train.recipe import Recipe, preset
 from nma.train.run import train_class
 
-# The paper's variants: (number of instances, whether the parameters follow the view direction).
+# The paper's variants: (number of instances, whether the parameters depend on the view direction).
 VARIANTS = {
     "single": (1, False),
     "omega_i": (1, True),
@@ -31,8 +31,8 @@ ALL = VARIANTS | INSTANCES
 
 @dataclass(frozen=True)
 class Job:
-    """One training. `size` is the number of training materials. A size of 0 means the validation set itself, which
-    gives the bound by overfitting."""
+    """One training. `size` is the number of training materials; 0 means training on the validation set, which gives a
+    lower bound of the validation error."""
 
     variant: str
     size: int
@@ -41,22 +41,25 @@ class Job:
 
     @property
     def stem(self) -> str:
-        """The name of the training's files, without a suffix."""
+        """The name of the training's files, without a suffix such as .safetensors."""
         words = self.variant.replace(" + ", "+").replace(" ", "-"), self.size or "overfit"
         return "{}_{}_{}-steps_seed-{}".format(*words, self.steps, self.seed)
 
     @property
     def recipe(self) -> Recipe:
         instances, directional = ALL[self.variant]
-        # Only a target that follows wi can be stretched in the plane of incidence.
+        # A target stretched along the plane of incidence depends on wi, so a target that does not must be "principled".
         target = None if directional else "principled"
         settings = {"instances": instances, "directional": directional, "target": target}
         return preset("class", **settings, steps=self.steps, seed=self.seed)
 
 
 def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list[Job]:
-    """All jobs in their order. Seed comes after seed, so that early results cover all variants. The bounds, and the
-    targets of more `instances`, are trained with the first seed only."""
+    """Returns all jobs in the order of training.
+
+    All variants are trained with one seed before the next seed, so that early results cover all variants. The
+    trainings on the validation set, and the variants `instances`, have only the first seed.
+    """
     jobs, sizes = [], sorted(set(sizes))
     for seed in range(seeds):
         jobs += [Job(name, size, seed, steps) for size in sizes for name in VARIANTS]
@@ -67,13 +70,13 @@ def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list
 
 
 class Store:
-    """The folder of weights and figures, and the data that they are made from.
+    """The folder of weights and metrics, with the data for training and validation.
 
-    Results that were made from other data are made again.
+    Stored weights and metrics that were made from other data are made again.
 
     Args:
-        folder: where weights and figures are kept.
-        data: a dataset; a training set is its first materials.
+        folder: where weights and metrics are kept.
+        data: the dataset, whose first materials are the training set.
         validation: the tables that every adapter is evaluated on.
         name: a name that identifies the validation set.
     """
@@ -85,7 +88,7 @@ class Store:
 
     @cached_property
     def _tables(self) -> nma.Tables:
-        """All tables of the dataset. They are read when a training first needs them."""
+        """All tables of the dataset, which are read only if a training needs them."""
         return self._dataset.load()
 
     def check(self, sizes: list[int]) -> None:
@@ -100,7 +103,7 @@ class Store:
         return self.folder / f"{job.stem}.safetensors"
 
     def adapter(self, job: Job) -> nma.Adapter | None:
-        """The trained adapter of a job, or None if it does not exist or was trained with other settings."""
+        """Returns the trained adapter of a job, or None if no adapter with the job's settings and data exists."""
         path = self.weights(job)
         if not path.exists():
             return None
@@ -109,7 +112,7 @@ class Store:
         return adapter if all(found.get(k) == v for k, v in wanted.items()) else None
 
     def train(self, job: Job) -> nma.Adapter:
-        """The adapter of a job. It is trained if it does not exist; a killed training continues from its checkpoint."""
+        """Returns the adapter of a job, and trains it if it does not exist, from its checkpoint if possible."""
         done = self.adapter(job)
         if done:
             return done
@@ -124,10 +127,11 @@ class Store:
         return adapter
 
     def log_losses(self, job: Job, adapter: nma.Adapter) -> dict[str, Any]:
-        """The mean figures of an adapter on the validation set, from the cache if possible."""
+        """Returns the mean metrics of an adapter on the validation set, from the stored metrics if they exist."""
 
         def measure() -> dict[str, float]:
-            # This uses a quarter of the points of `nma.evaluate_adapter`. For all variants, it finds .00003 more.
+            # With 16 directions, `figures` uses a quarter of the points that `nma.evaluate_adapter` uses. For all
+            # variants, this makes the log loss .00003 larger.
             found = common.figures(adapter, self.validation, directions=16)
             return {name: round(value, 7) for name, value in mean_metrics(found).items()}
 
@@ -136,8 +140,10 @@ class Store:
     def cached(
         self, job: Job, kind: str, settings: dict[str, Any], adapter: nma.Adapter, make: Callable[[], Any]
     ) -> Any:
-        """The result of `make` for these settings and this training, kept in STEM.KIND.json. `make` is called only if
-        the file has no such result."""
+        """Returns the result of `make` for the given settings and training, and stores it in the file STEM.KIND.json.
+
+        `make` is called only if the file does not contain this result.
+        """
         path = self.folder / f"{job.stem}.{kind}.json"
         key = json.loads(json.dumps({**settings, "training": adapter.training}))
         if path.exists():
@@ -156,7 +162,7 @@ class Store:
         return self._tables[: job.size]
 
     def _record(self, job: Job) -> dict[str, Any]:
-        """The entries of the weights file that say where the training data come from."""
+        """Returns the entries of the weights file that describe the training data."""
         if job.size == 0:
             return {"data": f"validation set {self._name}"}
         return {
