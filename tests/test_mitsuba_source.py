@@ -235,8 +235,8 @@ def changed(fields, **others):
         ({"vndf": None}, "field 'vndf' is missing"),
         ({"rgb": None, "spectra": np.zeros((1, 8, 4, 2, 2), np.float32)}, "holds spectra; take .*_rgb.bsdf"),
         ({"theta_i": np.zeros(7, np.float32)}, r"field 'vndf' has shape \(1, 8,"),
-        ({"ndf": np.zeros(128, np.float32)}, "field 'ndf' has shape .*, not 2 dimensions"),
-        ({"sigma": np.full((2, 128), np.nan, np.float32)}, "field 'sigma' is not finite"),
+        ({"ndf": np.zeros(128, np.float32)}, "field 'ndf' has shape .*, but must have 2 dimensions"),
+        ({"sigma": np.full((2, 128), np.nan, np.float32)}, "field 'sigma' has values that are not finite"),
         ({"theta_i": np.linspace(1.5, 0.0, 8, dtype=np.float32)}, "field 'theta_i' does not ascend"),
         ({"theta_i": np.full(8, 0.5, np.float32)}, "field 'theta_i' does not ascend"),
         ({"theta_i": np.linspace(0.0, 90.0, 8, dtype=np.float32)}, r"does not ascend within 0 \.\. 1\.571"),
@@ -253,13 +253,13 @@ def test_a_material_without_its_fields_is_refused(bsdf_file, tmp_path, change, m
     ("cut", "message"),
     [
         (lambda content: b"", "empty"),
-        (lambda content: b"not a material", "no tensor file"),
+        (lambda content: b"not a material", "not a tensor file"),
         (lambda content: content[:15], "truncated or damaged"),
         (lambda content: content[:300], "truncated or damaged"),
         (lambda content: content[:-1024], "truncated or damaged"),
         (lambda content: content[: len(content) // 2], "truncated or damaged"),
         (lambda content: content[:12] + b"\2" + content[13:], r"version 2\.0"),
-        (lambda content: content[:29] + b"\xff" + content[30:], r"field 'version' has type 255"),
+        (lambda content: content[:29] + b"\xff" + content[30:], r"field 'version' has the unknown type 255"),
     ],
 )
 def test_a_damaged_material_is_refused(bsdf_file, tmp_path, cut, message):

@@ -98,9 +98,11 @@ def test_texts_never_take_a_network_for_a_measurement(merl_file, rgl_file):
 
 
 def test_a_material_that_is_not_there_is_refused(merl_file):
-    with pytest.raises(SourceError, match="no material 'crome' among its 100; did you mean 'chrome'"):
+    with pytest.raises(
+        SourceError, match="no material 'crome' among its 100 materials; did you mean 'chrome'"
+    ):
         read(merl_file, "crome")
-    with pytest.raises(SourceError, match="no material 'zzz' among its 100; it has alum-bronze"):
+    with pytest.raises(SourceError, match="no material 'zzz' among its 100 materials; it has alum-bronze"):
         read(merl_file, "zzz")
     with pytest.raises(SourceError, match=r"holds 100 material\(s\); say which: alum-bronze, "):
         read(merl_file)

@@ -286,5 +286,7 @@ def test_classes_are_registered_by_their_names():
 
 
 def test_an_unknown_class_is_refused():
-    with pytest.raises(ParamError, match="there is no class 'paint'; there is layered3, measured, library"):
+    with pytest.raises(
+        ParamError, match="there is no class 'paint'; the classes are layered3, measured, library"
+    ):
         sources.space("paint")

@@ -1,7 +1,8 @@
-"""The sources: models and files that say how materials look.
+"""Sources of appearance: models that simulate materials, and files that store BRDF values of materials.
 
 To simulate a new class of materials, add one file to this folder, with the class's parameters and its source, and one
-line to `CLASSES`. To read a new kind of file with the values of materials, add one file and one line to `FORMATS`.
+line to `CLASSES`. To read a new format of files that store BRDF values, add one file to this folder and one line to
+`FORMATS`.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
     from nma.sources.base import Source, Values
     from nma.sources.files import Format
 
-# Both registries name a module of this folder and a name in it. The module is imported when it is first needed.
-# Classes that can be simulated, with their sources. The `space` of a source has the parameters of its class.
+# An entry of either registry has the form `module:name`: a module of this folder, and a name defined in the module. The
+# module is imported when the entry is first used. The keys of `CLASSES` are the classes that can be simulated, and the
+# values are their sources. The `space` of a source has the parameters of its class.
 CLASSES = {"layered3": "layered:Layered3"}
-# Formats of files with values, by file extension:
+# Formats of files that store BRDF values, by the extension of the files:
 FORMATS = {
     ".binary": "merl:FORMAT",
     ".bsdf": "mitsuba_bsdf:MEASURED",
@@ -29,13 +31,13 @@ FORMATS = {
 }
 
 
-# Parameters that are needed without a source: those of classes that cannot be simulated, and those of the shipped
-# adapters, which load without Dr.Jit. Sources import Dr.Jit.
+# The parameters of classes that cannot be simulated, and of the classes of the shipped adapters. Shipped adapters must
+# load without Dr.Jit, so their parameters cannot come from a source, which imports Dr.Jit.
 _SPACES = {space.name: space for space in (LAYERED3, MEASURED, LIBRARY)}
 
 
 def classes() -> tuple[str, ...]:
-    """Names of all classes: those that can be simulated, `measured` and `library`."""
+    """Names of all classes: the classes that can be simulated, `measured` and `library`."""
     return tuple(dict.fromkeys((*CLASSES, *_SPACES)))
 
 
@@ -44,7 +46,7 @@ def space(name: str) -> ParamSpace:
     if name in _SPACES:
         return _SPACES[name]
     if name not in CLASSES:
-        raise ParamError(f"there is no class '{name}'; there is {', '.join(classes())}")
+        raise ParamError(f"there is no class '{name}'; the classes are {', '.join(classes())}")
     return get(name).space
 
 
@@ -61,19 +63,19 @@ def get(name: str) -> Source:
 
 
 def formats() -> dict[str, Format]:
-    """The formats of files that `read` understands, by the extension of the files."""
+    """The file formats that `read` can read, by file extension."""
     return {ending: _at(home) for ending, home in FORMATS.items()}
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file, by its extension. Raises `SourceError` if no source reads such files."""
+    """The format that a file has according to its extension. Raises `SourceError` if no source reads such files."""
     if path.suffix not in FORMATS:
         raise SourceError(f"{path}: no source reads such files; readable files end in {', '.join(FORMATS)}")
     return _at(FORMATS[path.suffix])
 
 
 def read(path: str | Path, material: str | None = None) -> Values:
-    """Reads the values of one material from a file.
+    """Reads the values (`Values`) of one material from a file.
 
     The file is a MERL `.binary`, an RGL `.bsdf`, a Mitsuba BSDF in `.xml`, or an `.npz` with NBRDF networks, where
     `material` names the network. Raises `SourceError` for any other file, and for a missing or damaged file.
@@ -89,6 +91,6 @@ def read(path: str | Path, material: str | None = None) -> Values:
 
 
 def _at(home: str) -> Any:
-    """The object that a registry gives as `module:name`."""
+    """The object that a registry names as `module:name`."""
     module, name = home.split(":")
     return getattr(import_module(f"nma.sources.{module}"), name)

@@ -1,4 +1,4 @@
-"""The interfaces of sources: models that walks sample (`Source`) and models that are evaluated (`Values`)."""
+"""The interfaces of sources: models that random walks sample (`Source`), and models that are evaluated (`Values`)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class Random(Protocol):
 
 @dataclass
 class Walk:
-    """One random walk per lane, in a form that Dr.Jit's symbolic loops can carry.
+    """One random walk per lane, in a form that can be the state of a symbolic loop of Dr.Jit.
 
-    `direction` is where an `alive` walk is heading. Once a walk has left the material, its `direction` is wo (z > 0).
-    A walk that was absorbed has throughput 0.
+    `direction` is the direction in which an `alive` walk travels. Once a walk has left the material, `direction` is wo
+    (z > 0). A walk that was absorbed has throughput 0.
     """
 
     direction: tuple[Float, Float, Float]
     throughput: tuple[Float, Float, Float]
     height: Float  # 1 at the top of the slab, 0 at its bottom
-    inside: Mask  # the walk has entered the material
+    inside: Mask  # true once the walk has entered the material
     alive: Mask
 
     @staticmethod
@@ -47,9 +47,10 @@ class Walk:
 class Source(Protocol):
     """A stochastic appearance model g(wi) -> (wo, throughput), paper eq. 8, simulated event by event.
 
-    For any set of directions wo, the expected throughput that a walk carries out through the set is the integral of
-    f cos(theta_o) over the set. A model that can only evaluate f draws wo from a density p at the first event and
-    returns f cos(theta_o) / p. Throughputs should hardly exceed 1, because tables count them in fixed point.
+    A walk leaves the material in a direction wo, with a throughput. For any set of directions, count the throughput as
+    0 if wo is not in the set: its expected value is then the integral of f cos(theta_o) over the set. A model that can
+    only evaluate f may draw wo from a density p at the first event and return the throughput f cos(theta_o) / p.
+    Throughputs should hardly exceed 1, because tables sum them as 32-bit integers, which could overflow.
     """
 
     space: ParamSpace
@@ -59,16 +60,19 @@ class Source(Protocol):
         ...
 
     def step(self, params: Any, walk: Walk, rng: Random) -> Walk:
-        """Advances every walk by one event. Lanes whose walk has ended may return anything, as callers mask them."""
+        """Advances every walk by one event.
+
+        The results for walks that have ended may be arbitrary, because callers ignore these results.
+        """
         ...
 
 
 class Values(Protocol):
     """An appearance model that can only be evaluated: a measurement, a table, a network or a renderer's BSDF.
 
-    `name` stands for the model in messages. `isotropic` says that the value stays the same when both directions turn
-    about the normal. An isotropic model may still give another value for the mirror image of a pair of directions. The
-    folded bins of a table hold the mean of the two values.
+    `name` is the model's name in messages. `isotropic` is true if the value stays the same when both directions are
+    rotated about the normal by the same angle. An isotropic model may still have different values for a pair of
+    directions and for the mirror image of the pair. The folded bins of a table hold the mean of these two values.
     """
 
     @property
@@ -78,12 +82,13 @@ class Values(Protocol):
     def isotropic(self) -> bool: ...
 
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
-        """f(wi, wo) cos(theta_o) [1/sr] for one pair of unit directions per Dr.Jit lane; 0 below the horizon.
+        """f(wi, wo) cos(theta_o) [1/sr] for one pair of unit directions per Dr.Jit lane.
 
-        The colour is linear sRGB without bounds: a measured colour outside the gamut has a negative channel.
+        It is 0 if a direction is below the horizon. The colour is linear sRGB without bounds: a measured colour outside
+        the gamut has a negative channel.
 
-        Lanes are float32. Their types may carry derivatives, but `eval` does not propagate derivatives. The call may be
-        traced into a kernel, so it must not branch on values or read them.
+        Lanes are float32. Their type may be a differentiable type of Dr.Jit, but `eval` does not propagate derivatives.
+        Dr.Jit may trace the call into a kernel, so `eval` must not read the values of lanes or branch on them.
         """
         ...
 
@@ -100,7 +105,7 @@ def throughput(walk: Walk) -> Color:
 
 
 def walk(source: Source, params: Any, wi: Vec3, rng: Random, active: Mask = True) -> tuple[Vec3, Color]:
-    """Runs one whole walk per lane from `wi` (wi.z > 0) and returns (wo, throughput), with wo.z > 0.
+    """Runs one walk per lane from `wi` (wi.z > 0) to its end, and returns (wo, throughput), with wo.z > 0.
 
     The throughput is 0 where the walk was absorbed or the lane is not `active`. The loop is symbolic, so the function
     can be called inside a renderer's own loop.

@@ -1,7 +1,7 @@
-"""The public measurements that sources read: a list of all, and a check of a user's copy.
+"""Lists the public measurements that sources can read, and checks a user's copy of them.
 
-Nothing is downloaded. The licence of measurements decides what a user may do with the files and with everything made
-from them.
+This module downloads nothing. The licence of measurements decides what a user may do with the files and with everything
+made from them.
 """
 
 from __future__ import annotations
@@ -19,13 +19,17 @@ MEASUREMENTS = tuple(m for form in sources.formats().values() for m in form.meas
 # The formats in which measurements are published, by file extension.
 _FORMATS = {ending: form for ending, form in sources.formats().items() if form.measurements}
 _ENDINGS = ", ".join(sorted(_FORMATS))
-# Size and checksum of original files, by name.
+# Size and checksum of original files, by the file's name.
 _KNOWN = {name: known for m in MEASUREMENTS for name, known in m.known.items()}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What `check` found out about a file: its measurements, whether the file is sound (`ok`), and the reason."""
+    """The result of `check` for one file.
+
+    `measurements` is the name of the measurements that the file belongs to. `ok` is true if the file is undamaged, and
+    `note` gives the reason.
+    """
 
     path: Path
     measurements: str
@@ -34,10 +38,10 @@ class Finding:
 
 
 def check(path: str | Path) -> Iterator[Finding]:
-    """Checks one file, or all files of measurements in a folder and its subfolders. Yields a `Finding` for each.
+    """Checks one file, or all files of measurements in a folder and its subfolders. Yields a `Finding` for each file.
 
-    The check compares the file's size and checksum with the known ones. It also reads the file, to see whether its
-    structure and its values make sense. Raises `SourceError` if there is no file to check.
+    The check compares the file's size and checksum with those of the original file, if they are known. It also reads
+    the file, to test whether its structure and its values are valid. Raises `SourceError` if there is no file to check.
     """
     path = Path(path)
     if not os.path.exists(path):
@@ -53,7 +57,7 @@ def check(path: str | Path) -> Iterator[Finding]:
 
 
 def _check_file(path: Path) -> Finding:
-    """Checks one file."""
+    """Checks one file of measurements."""
     form = _FORMATS.get(path.suffix)
     if form is None or form.identify is None:
         return Finding(path, "", False, f"no file of known measurements ({_ENDINGS})")
@@ -74,5 +78,5 @@ def _check_file(path: Path) -> Finding:
 
 
 def _belongs(path: Path) -> bool:
-    """Whether a file in a folder looks like part of measurements."""
+    """Whether a file belongs to measurements, judged by its name, or else by its extension and content."""
     return path.name in _KNOWN or (path.suffix in _FORMATS and _FORMATS[path.suffix].claims(path))

@@ -1,9 +1,10 @@
 """A rough metal under a clear or tinted coat, in closed form: the analytic coating model of production renderers.
 
-The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". It adds two microfacet
-reflections: that of the coat, and that of the metal. The metal's reflection is evaluated for the directions refracted
-at the mean surface. It is multiplied by the Fresnel transmittance and the absorption of the way in and of the way out.
-Light that bounces between the two interfaces is left out, so the model is darker than a simulation of the stack.
+The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". It is the sum of two microfacet
+reflections: the coat's reflection and the metal's reflection. The metal's reflection is evaluated for the directions
+refracted at the mean surface. It is multiplied by two transmittances for each of the two directions: the Fresnel
+transmittance of the coat's surface, and the transmittance of the absorbing coat. Light that bounces between coat and
+metal is left out, so the model is darker than a simulation of the stack.
 """
 
 from __future__ import annotations
@@ -64,8 +65,9 @@ class Coating:
             inside_i, inside_o, self.alpha_metal
         )
         path = 1.0 / inside_i.z + 1.0 / inside_o.z
-        # On the way out, refraction multiplies the solid angle of the beam by eta^2 cos(inside) / cos(outside). So the
-        # metal's reflection is divided by this factor.
+        # Where light leaves the coat, refraction multiplies the solid angle of a beam by eta^2 cos(inside) /
+        # cos(outside), where inside and outside are the angles to the normal. So the metal's reflection is divided by
+        # this factor.
         through = (1.0 - loss_i) * (1.0 - loss_o) * o.z / (self.eta * self.eta * inside_o.z)
         dimmed = Color(
             *(c * through * ops.exp(-a * path) for c, a in zip(metal, self.absorption, strict=True))
@@ -74,18 +76,18 @@ class Coating:
 
 
 def _facing(wi: Vec3, wo: Vec3) -> Float:
-    """Cosine of the angle between `wi` and the half vector, the same for `wo`."""
+    """Cosine of the angle between `wi` and the half vector, which equals the angle between `wo` and the half vector."""
     h = wi + wo
     return 0.5 * ops.sqrt(ops.dot(h, h))
 
 
 def _lobe(wi: Vec3, wo: Vec3, alpha: float) -> Float:
-    """A microfacet reflection times cos(theta_o), without its Fresnel term. Walter 2007, eq. 20, separable masking."""
+    """A microfacet reflection times cos(theta_o), without its Fresnel term (Walter 2007, eq. 20, separable masking)."""
     h = ops.normalize(wi + wo)
     return ggx_d(h, alpha, alpha) * smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha) / (4.0 * wi.z)
 
 
 def _refracted(w: Vec3, eta: float) -> tuple[Vec3, Float]:
-    """The direction refracted at the mean surface, turned upwards again, and the reflected share of the light."""
+    """The direction `w` refracted at the mean surface, mirrored to point up, and the fraction of reflected light."""
     loss, cos_t = fresnel_dielectric(w.z, eta)
     return Vec3(w.x / eta, w.y / eta, cos_t), loss

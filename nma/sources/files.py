@@ -1,4 +1,4 @@
-"""Files with the values of materials: the declaration of their formats, and a function that reads their bytes."""
+"""File formats that store BRDF values: how a format is declared, and a function that reads a file's bytes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from nma.sources.base import Values
 
 @dataclass(frozen=True)
 class Measurements:
-    """Published measurements of materials, or neural reconstructions of measurements. `kind` says which.
+    """Published measurements of materials, or neural reconstructions of measurements; `kind` tells which of the two.
 
-    `files` describes the files of a complete copy. `known` gives the size in bytes and the SHA-256 of a file by its
-    name; files that we had no copy of are not in it.
+    `files` describes the files of a complete copy. `known` maps the name of a file to its size in bytes and its
+    SHA-256. `known` lacks the files that we had no copy of.
     """
 
     name: str
@@ -29,12 +29,14 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Format:
-    """A format of files with the values of materials. All functions raise `SourceError` for a damaged file.
+    """A format of files that store BRDF values of materials. Its functions raise `SourceError` for a damaged file.
 
-    `read(path)` returns the values of the material in a file. If a file holds several materials, `names(path)` lists
-    them, and `read(path, name)` returns the values of one. `measurements` are the measurements that are published in
-    this format. `identify(path)` reads the whole file and returns the name of its measurements. For a damaged file, the
-    format's `name` is used instead. `claims(path)` says whether a file with the right extension has this format.
+    `read(path)` returns the values (`Values`) of the material in a file. If a file holds several materials,
+    `names(path)` lists their names, and `read(path, name)` returns the values of the material `name`. `measurements`
+    are the published measurements that have this format. `identify(path)` reads the whole file and returns the name of
+    the measurements that the file belongs to. If the file is damaged, messages use the format's `name` instead.
+    `claims(path)` tells whether a file with the format's extension does have this format, since other formats may have
+    the same extension.
     """
 
     name: str
@@ -46,7 +48,10 @@ class Format:
 
 
 def content(path: Path, measurements: str) -> bytes:
-    """All bytes of a file. Raises `SourceError` if it cannot be read; `measurements` is a name for this message."""
+    """Reads all bytes of a file.
+
+    Raises `SourceError` if the file cannot be read; the message contains `measurements`.
+    """
     try:
         return path.read_bytes()
     except FileNotFoundError:

@@ -1,8 +1,9 @@
-"""Rusinkiewicz coordinates: the half vector, and the light direction in its frame, called the difference vector.
+"""Rusinkiewicz coordinates: the half vector, and the light direction in the half vector's frame (difference vector).
 
-Rusinkiewicz 1998, "A New Change of Variables for Efficient BRDF Representation". The difference vector is built from
-the *light* direction. Built from the view direction, it would have the opposite azimuth, phi_d + pi. All functions here
-are for isotropic materials, so they turn the half vector to azimuth 0.
+The coordinates are those of Rusinkiewicz 1998, "A New Change of Variables for Efficient BRDF Representation". The
+difference vector is built from the *light* direction. A difference vector built from the view direction would have the
+azimuth phi_d + pi instead of phi_d. All functions in this module are for isotropic materials, so they rotate the half
+vector to azimuth 0.
 """
 
 from __future__ import annotations
@@ -12,18 +13,19 @@ from nma.ops import Float, Vec3
 
 
 def half_difference(light: Vec3, view: Vec3) -> tuple[Vec3, Vec3]:
-    """Returns (half vector turned to azimuth 0, difference vector), both of unit length.
+    """Returns (half vector rotated to azimuth 0, difference vector), both of unit length.
 
-    `light` and `view` are unit directions above the surface. For any other directions the result is finite.
+    `light` and `view` are unit directions above the surface. For other directions the result is finite, but has no
+    meaning.
     """
     h = light + view
     h = h * (1.0 / ops.maximum(ops.sqrt(ops.dot(h, h)), 1e-12))
     sin_h = ops.safe_sqrt(h.x * h.x + h.y * h.y)
-    # A vertical half vector has no azimuth: take 0.
+    # A half vector along the normal has no azimuth, so 0 is taken as its azimuth.
     tilted = sin_h > 1e-12
     inv = 1.0 / ops.select(tilted, sin_h, 1.0)
     cos_phi, sin_phi = ops.select(tilted, h.x * inv, 1.0), ops.select(tilted, h.y * inv, 0.0)
-    # Turn the light by -phi_h about the normal, then by -theta_h about y.
+    # Rotate the light direction by -phi_h about the normal, then by -theta_h about y.
     x, y = cos_phi * light.x + sin_phi * light.y, cos_phi * light.y - sin_phi * light.x
     difference = Vec3(h.z * x - sin_h * light.z, y, sin_h * x + h.z * light.z)
     return Vec3(sin_h, 0.0 * sin_h, h.z), difference

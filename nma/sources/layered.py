@@ -1,8 +1,8 @@
 """Position-free random walks through a rough dielectric over a homogeneous medium over a rough conductor.
 
-Guo, Hasan and Zhao 2018, "Position-Free Monte Carlo Simulation for Arbitrary Layered BSDFs". Only depth matters, so a
-walk consists of a direction, a height in a slab of thickness 1, and a throughput. The code needs Dr.Jit, but no
-renderer.
+The method is that of Guo, Hasan and Zhao 2018, "Position-Free Monte Carlo Simulation for Arbitrary Layered BSDFs". The
+layers are the same at every point of the surface, so the position along the surface does not matter: a walk consists of
+a direction, a height in a slab of thickness 1, and a throughput. The code needs Dr.Jit, but no renderer.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from nma.ops import Color, Float, Vec3
 from nma.params import LAYERED3
 from nma.sources.base import Random, Walk
 
-# Russian roulette begins where the brightest channel of the throughput falls below this threshold. Of the thresholds
-# tried, .5 had the smallest product of variance and time.
+# Russian roulette begins when the brightest channel of a walk's throughput falls below this threshold. Of the
+# thresholds tried, .5 had the smallest product of variance and time.
 ROULETTE_THRESHOLD = 0.5
-# Chance of survival after total internal reflection. With a chance of 1, some walks would never end between a smooth
-# coat and a perfect mirror without a medium.
+# The largest probability with which a walk survives total internal reflection. With probability 1, some walks between a
+# smooth coat and a perfect mirror, without a medium, would never end.
 TRAPPED_SURVIVAL = 0.999
 
 
 @dataclass
 class Stack:
-    """The stack, one value per lane. The conductor's indices of refraction are relative to the index of the coat."""
+    """The parameters of the stack, one value per lane."""
 
     alpha_top: Float
     alpha_bottom: Float
     eta_top: Float
-    eta_bottom: tuple[Float, Float, Float]
-    k_bottom: tuple[Float, Float, Float]
+    eta_bottom: tuple[Float, Float, Float]  # the conductor's index of refraction divided by eta_top
+    k_bottom: tuple[Float, Float, Float]  # the conductor's extinction coefficient divided by eta_top
     albedo: tuple[Float, Float, Float]
     sigma_t: Float
 
@@ -54,7 +54,8 @@ class Layered3:
         """The stack from the 13 columns of the class's parameter vector."""
         alpha_top, alpha_bottom, eta_top, *rest = columns
         eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
-        # The conductor's Fresnel term sees the index of the coat, not that of air.
+        # Light reaches the conductor from the coat, not from air, so the conductor's index is divided by the coat's
+        # index.
         inv = 1.0 / eta_top
         return Stack(
             alpha_top,
@@ -67,7 +68,10 @@ class Layered3:
         )
 
     def step(self, params: Stack, walk: Walk, rng: Random) -> Walk:
-        """One free flight and one event: scattering in the medium, or reflection or refraction at an interface."""
+        """Simulates one free flight and one event.
+
+        The event is scattering in the medium, or reflection or refraction at an interface.
+        """
         u_flight, u_lobe = rng.next_float32(), rng.next_float32()
         u1, u2 = rng.next_float32(), rng.next_float32()
         d = Vec3(*walk.direction)
@@ -85,8 +89,8 @@ class Layered3:
         m = sample_visible_normal(w, alpha, alpha, u1, u2)
         cos_m = dr.maximum(ops.dot(w, m), 0.0)
 
-        # The coat reflects with a probability equal to its Fresnel term. The conductor always reflects, and the
-        # throughput is multiplied by its colour.
+        # The coat reflects with a probability equal to its Fresnel term. The conductor always reflects, and its Fresnel
+        # reflectance multiplies the throughput.
         eta = dr.select(upward, 1.0 / params.eta_top, params.eta_top)
         fresnel, cos_t = fresnel_dielectric(cos_m, eta)
         reflects = at_bottom | (u_lobe < fresnel)
@@ -97,7 +101,8 @@ class Layered3:
         tint = fresnel_conductor_rgb(cos_m, Color(*params.eta_bottom), Color(*params.k_bottom))
         weight = ops.select(at_bottom, tint, Color.of(1.0)) * smith_g1(out, alpha, alpha)
         weight = ops.select(valid, weight, Color.of(0.0))
-        # Go back to the slab's frame: for a walk below the coat, the normal pointed down.
+        # Return to the slab's frame. For a walk that hits the coat from below, the normal pointed down, so z changes
+        # its sign.
         out = Vec3(out.x, out.y, dr.select(upward, -out.z, out.z))
 
         # In the medium, scatter isotropically.
@@ -120,9 +125,10 @@ def _uniform_sphere(u1: Float, u2: Float) -> Vec3:
 
 
 def _roulette(value: Color, exempt: Any, trapped: Any, rng: Random) -> tuple[Any, Color]:
-    """Russian roulette on the brightest channel. Returns (survives, `value` divided by the chance of survival).
+    """Russian roulette by the brightest channel: returns (survives, `value` divided by the probability of survival).
 
-    Walks that are `exempt` always survive. Walks that are `trapped` survive with `TRAPPED_SURVIVAL` at most.
+    Walks that are `exempt` always survive. Walks that are `trapped` survive with a probability of at most
+    `TRAPPED_SURVIVAL`.
     """
     most = dr.select(trapped, TRAPPED_SURVIVAL, 1.0)
     chance = dr.select(exempt, 1.0, dr.minimum(ops.max_component(value) * (1.0 / ROULETTE_THRESHOLD), most))

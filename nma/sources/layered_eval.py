@@ -1,15 +1,16 @@
-"""The layered source at a given pair of directions: an unbiased estimate of f cos(theta_o), and a similar density.
+"""Evaluates the layered source at a pair of directions: an unbiased estimate of f cos(theta_o), and a density of wo.
 
-Random walks measure the light that leaves through a set of directions. A renderer also asks for the value at a single
-pair (wi, wo). The light from wi to wo splits into three kinds:
+Random walks estimate the light that leaves in a set of directions. A renderer also needs the value at a single pair
+(wi, wo), which this module estimates. The light from wi to wo is split into three kinds:
 
-- Light that the coat's upper side reflects. It has a closed form.
+- Light that the coat's upper side reflects. This light has a closed form.
 - Light that enters the coat and meets interfaces only.
 - Light that enters the coat and scatters in the medium at least once.
 
-The last two kinds are sampled so that two narrow lobes never have to meet by chance (compare Guo, Hasan and Zhao 2018,
-section 5). All densities are those of particles, as in the walk. Unlike radiance, they do not change by the squared
-index of refraction when a walk enters the coat.
+For the last two kinds, a walk from wi is connected with a walk from wo, so that the estimate never depends on two
+narrow lobes that meet by chance (compare Guo, Hasan and Zhao 2018, section 5). Densities and throughputs are those of
+particles, as in the random walk of `nma.sources.layered`. Unlike radiance, they do not change by the squared index of
+refraction when a walk enters the coat.
 """
 
 from __future__ import annotations
@@ -32,38 +33,41 @@ from nma.ops import Color, Float, Mask, Vec3
 from nma.sources.base import Random, Walk, throughput
 from nma.sources.layered import Layered3, Stack
 
-# A coat whose index is closer to 1 than this bends light too little for single precision, so `settle` sets it to 1.
+# If the coat's index of refraction is closer to 1 than this, single precision cannot represent the refraction, so
+# `settle` sets the index to 1.
 INDEX_MATCHED = 1e-3
 _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
-# The least weight of the cosine lobe before normalisation, for light that the other lobes do not cover.
+# The least weight of the cosine lobe in `lobes`, before the weights are normalised. This lobe covers the directions
+# that the other two lobes leave out.
 LEAST_DIFFUSE = 0.03
 
 
 def settle(stack: Stack) -> Stack:
-    """The stack in the form that `evaluate` and `pdf` need: an almost index-matched coat gets the index 1 exactly."""
+    """Sets the coat's index to exactly 1 if it is almost 1. `evaluate` and `pdf` need a stack in this form."""
     return replace(stack, eta_top=dr.select(stack.eta_top < 1.0 + INDEX_MATCHED, 1.0, stack.eta_top))
 
 
 def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True) -> Color:
     """One unbiased estimate per lane of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
 
-    `stack` must come from `settle`. The expected integral over a set of wo equals the expected throughput that
-    `nma.sources.base.walk` carries through the set.
+    `stack` must come from `settle`. The integral of the estimate's expected value over a set of directions wo equals
+    the expected throughput that `nma.sources.base.walk` carries out of the material in these directions.
     """
     there, back = _enter(stack, wi, rng), _enter(stack, wo, rng)
     there.alive = back.alive = there.alive & back.alive & active
     forward, _ = _unscattered(stack, wi, there, wo, back, rng, True)
     backward, detour = _unscattered(stack, wo, back, wi, there, rng, False)
     scattered = _scattered(stack, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
-    # Walks from wo estimate f cos(theta_i), which reciprocity turns into f cos(theta_o). Scattered light connects below
-    # the coat, where radiance is larger by the squared index, so it is divided by that.
+    # Walks from wo estimate f cos(theta_i). Since f is reciprocal, the factor cos(theta_o) / cos(theta_i) turns the
+    # estimate into f cos(theta_o). Light that scatters in the medium is connected below the coat, where radiance is
+    # larger by the squared index of refraction, so this light is divided by the squared index.
     index2 = stack.eta_top * stack.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(stack, wi, wo)
 
 
 def coat_reflection(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
-    """f cos(theta_o) [1/sr] of the reflection at the coat's upper side alone. Walter 2007, eq. 20."""
+    """f cos(theta_o) [1/sr] of the reflection at the coat's upper side alone (Walter 2007, eq. 20)."""
     m = ops.normalize(wi + wo)
     fresnel, _ = fresnel_dielectric(ops.maximum(ops.dot(wi, m), 0.0), stack.eta_top)
     alpha = stack.alpha_top
@@ -72,9 +76,9 @@ def coat_reflection(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
 
 
 def _enter(stack: Stack, w: Vec3, rng: Random) -> Walk:
-    """A walk that has come from `w` and is now just below the coat.
+    """Starts a walk that has arrived from `w`, and has been refracted into the coat.
 
-    The walk always refracts, because the light that the coat reflects has a closed form.
+    The walk is never reflected here, because the light that the coat reflects has a closed form (`coat_reflection`).
     """
     alpha = stack.alpha_top
     view = _above(w)
@@ -87,26 +91,26 @@ def _enter(stack: Stack, w: Vec3, rng: Random) -> Walk:
 
 
 def _crossing(stack: Stack, walk: Walk) -> Walk:
-    """The walk after crossing the whole slab, its throughput multiplied by the slab's transmittance."""
+    """The walk after it has crossed the whole slab: the slab's transmittance multiplies its throughput."""
     dimmed = throughput(walk) * _transmittance(stack, 1.0, Vec3(*walk.direction))
     return replace(walk, throughput=tuple(dimmed))
 
 
 def _transmittance(stack: Stack, depth: Float, w: Vec3) -> Float:
-    """Fraction of light along `w` that passes `depth` of the slab (1: the whole slab) without meeting the medium."""
+    """Fraction of light along `w` that crosses the fraction `depth` of the slab without a collision."""
     return ops.exp(-stack.sigma_t * depth / ops.maximum(ops.absolute(w.z), 1e-7))
 
 
 @dataclass
 class _Detour:
-    """One segment of a walk after its first segment, chosen by weighted reservoir sampling (Chao 1982)."""
+    """One segment of a walk, chosen from all but the first segment by weighted reservoir sampling (Chao 1982)."""
 
     direction: tuple[Float, Float, Float]
     tint: tuple[Float, Float, Float]
     total: Float
 
     def offer(self, walk: Walk, rng: Random) -> _Detour:
-        """Chooses the current segment of `walk` instead, with a chance in proportion to its brightest channel."""
+        """Chooses the current segment of `walk` instead, with a probability proportional to its brightest channel."""
         weight = ops.select(walk.alive, ops.max_component(throughput(walk)), 0.0)
         total = self.total + weight
         take = rng.next_float32() * total < weight
@@ -118,22 +122,24 @@ class _Detour:
         )
 
     def chosen(self) -> tuple[Vec3, Color]:
-        """The segment's direction, and its throughput divided by the probability that it was chosen."""
+        """The chosen segment's direction, and its throughput divided by the probability of choosing it."""
         return Vec3(*self.direction), Color(*self.tint) * self.total
 
 
 def _unscattered(
     stack: Stack, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
 ) -> tuple[Color, tuple[Vec3, Color]]:
-    """Light from wi to wo that meets interfaces only, and one segment of the walk `there` after its first segment.
+    """Light from wi to wo that meets interfaces only, and one segment of the walk `there`, chosen by `_Detour`.
 
-    A path enters through the coat, visits the conductor once or more, and leaves through the coat. It is sampled from
-    both ends. All events are drawn except one, the connection: there the two ends meet, and the density of the event is
-    evaluated. The best connection is the event with the widest lobe. The walk from wi connects at the way out (the walk
-    goes on, and its density of leaving along wo is evaluated) or at the last visit (the way out is drawn from wo, as
-    `back`). The walk from wo connects at the way in or at the first visit. A path with one visit thus has three
-    possible connections. The balance heuristic (Veach 1997, eq. 9.8) combines the connections by the sharpness of their
-    events.
+    A path enters through the coat, hits the conductor once or more, and leaves through the coat. The path is sampled
+    from both ends, wi and wo. All its events are drawn at random except one, the connection, at which the two ends are
+    joined and whose density is evaluated. The best connection is the event with the widest lobe.
+
+    A walk from wi can be connected at two events. At the exit, the density of being refracted out along wo is
+    evaluated. At the last hit of the conductor, the exit is drawn from wo, as the walk `back`. A walk from wo can be
+    connected at the entrance or at the first hit. A path with a single hit thus has three possible connections:
+    entrance, hit and exit. The balance heuristic (Veach 1997, eq. 9.8) gives each connection a weight proportional to
+    its bluntness, which is the reciprocal of the event's density.
     """
     source, clear = Layered3(), replace(stack, sigma_t=stack.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
@@ -142,13 +148,13 @@ def _unscattered(
     matched = stack.eta_top == 1.0
 
     def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
-        """Light that a visit to the conductor sends to wo, and the bluntness of the walk's first visit.
+        """Light that a hit of the conductor sends to wo, and the bluntness of the walk's first hit.
 
-        `first` is 0 before the first visit, then its bluntness.
+        `first` is 0 before the first hit, and then the bluntness of the first hit.
         """
         w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
         rest = way_in + first
-        # Connect at the last visit. This is the only connection under an index-matched coat, which turns no light back.
+        # Connect at the last hit. Under an index-matched coat, which reflects no light, this is the only connection.
         q, t = drawn_out
         blunt = _bluntness(_sharpness(stack, w_in, drawn_up))
         share = ops.select(matched, 1.0, blunt / (blunt + rest + _bluntness(q)))
@@ -158,7 +164,7 @@ def _unscattered(
             _mirror_pdf(_above(w_in), drawn_up, stack.alpha_bottom) * t * _transmittance(stack, 1.0, drawn_up)
         )
         found = throughput(before) * _conductor_weight(stack, w_in, drawn_up) * (share * meets)
-        # Connect at the way out.
+        # Connect at the exit.
         q, t = _out_through_coat(stack, wo, went_up)
         blunt = _bluntness(_sharpness(stack, w_in, went_up))
         share = ops.select(matched, 0.0, _bluntness(q) / (_bluntness(q) + blunt + rest))
@@ -180,10 +186,11 @@ def _unscattered(
 
 
 def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
-    """Light that scatters in the medium. Every scattering vertex of the walk is connected to each of the `ways` out.
+    """Light that scatters in the medium. Every scattering vertex of the walk is connected to each exit path in `ways`.
 
-    A way out is the direction and the throughput of a segment of a walk from wo that met interfaces only. The medium
-    scatters into all directions, so a connection succeeds however narrow the lobes along the way out are.
+    An exit path is given by one segment, with direction and throughput, of a walk from wo that met interfaces only. The
+    medium scatters into all directions, so the connection transports light however narrow the lobes of the exit path
+    are.
     """
     source = Layered3()
 
@@ -191,7 +198,8 @@ def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: R
         after = source.step(stack, walk, rng)
         out = Color.of(0.0)
         for d, reached in ways:
-            # The light travels against the segment, from the vertex to the interface where the segment began.
+            # The light travels in the opposite direction of the segment: from the vertex to the interface where the
+            # segment began.
             depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
             out = out + reached * (_transmittance(stack, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
         found = throughput(walk) * Color(*stack.albedo) * out * _ISOTROPIC_PHASE
@@ -210,12 +218,12 @@ def _bluntness(density: Float) -> Float:
 
 
 def _sharpness(stack: Stack, w_in: Vec3, up: Vec3) -> Float:
-    """Approximate density [1/sr] of the conductor's reflection from `w_in` to `up`. It is the same in reverse."""
+    """Approximate density [1/sr] of the conductor's reflection from `w_in` to `up`, or from `up` to `w_in`."""
     return 0.25 * ggx_d(ops.normalize(w_in + up), stack.alpha_bottom, stack.alpha_bottom)
 
 
 def _conductor_weight(stack: Stack, w_in: Vec3, up: Vec3) -> Color:
-    """Factor of a walk's throughput where the conductor reflects it from `w_in` into `up`."""
+    """The factor by which the throughput of a walk changes when the conductor reflects it from `w_in` into `up`."""
     view = _above(w_in)
     cos_m = ops.dot(view, ops.normalize(view + up))
     tint = fresnel_conductor_rgb(cos_m, Color(*stack.eta_bottom), Color(*stack.k_bottom))
@@ -223,11 +231,11 @@ def _conductor_weight(stack: Stack, w_in: Vec3, up: Vec3) -> Color:
 
 
 def _out_through_coat(stack: Stack, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
-    """Two densities of refraction at the coat, returned as (q, t).
+    """The density q of refraction into the coat, and a factor t for refraction out of the coat.
 
-    q [1/sr] is the density of `up` when wo is refracted down at a visible normal. t is the density of wo given `up`,
-    divided by q; the microfacet distribution and the Jacobian cancel in t. Walter 2007, eq. 16 (half vector) and 17
-    (Jacobian).
+    q [1/sr] is the density of `up` when light from wo is refracted down at a visible normal. q t is the density of wo
+    when light along `up` is refracted out. In the quotient t of the two densities, the microfacet distribution and the
+    Jacobian cancel. The half vector is that of Walter 2007, eq. 16, and the Jacobian that of eq. 17.
     """
     alpha, eta = stack.alpha_top, stack.eta_top
     matched = eta == 1.0
@@ -244,30 +252,32 @@ def _out_through_coat(stack: Stack, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
 
 
 def _mirror_pdf(w: Vec3, out: Vec3, alpha: Float) -> Float:
-    """Density [1/sr] of `out` when `w` is reflected at a visible normal. Walter 2007, eq. 14."""
+    """Density [1/sr] of `out` when `w` is reflected at a visible normal (Walter 2007, eq. 14)."""
     m = ops.normalize(w + out)
     return visible_normal_pdf(w, m, alpha, alpha) / (4.0 * ops.maximum(ops.dot(w, m), 1e-7))
 
 
 def _above(w: Vec3) -> Vec3:
-    """`w` moved slightly above the horizon, where visible normals are undefined."""
+    """`w`, moved slightly above the horizon, because visible normals are undefined at the horizon."""
     return Vec3(w.x, w.y, ops.maximum(w.z, 1e-7))
 
 
 def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
-    """Weights of the three lobes of `pdf`, which sum to 1, and the width of the second lobe.
+    """Weights of the three lobes of `pdf`, whose sum is 1, and the width (alpha) of the second lobe.
 
-    The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The
-    squared width of the second lobe is the sum of the variances that tilted facets cause. A facet of the conductor
-    shifts the tangential part of a direction by 2 cos_t times the facet's slope. A facet of the coat shifts it by (eta
-    cos_t - cos_i) / eta times the facet's slope, and light crosses the coat twice.
+    The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. Tilted
+    facets of the conductor and of the coat widen the second lobe. Let cos_i be the cosine of wi, and cos_t the cosine
+    after refraction. A facet of the conductor shifts the tangential part of a direction by 2 cos_t times the facet's
+    slope. A facet of the coat shifts the tangential part by (eta cos_t - cos_i) / eta times the facet's slope, and
+    light crosses the coat twice. The variances of the three shifts are added. The second lobe is that of a conductor
+    whose facets alone would cause the total variance.
     """
     eta, cos_i = stack.eta_top, ops.maximum(wi.z, 1e-3)
     fresnel, cos_t = fresnel_dielectric(cos_i, eta)
     crossing = stack.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
     width2 = stack.alpha_bottom * stack.alpha_bottom + 2.0 * crossing * crossing
-    # The coat reflects the part of the conductor's lobe beyond the critical angle back down. That light may later leave
-    # in any direction.
+    # Beyond the critical angle, the coat reflects light of the conductor's lobe back down. Such light may later leave
+    # in any direction, so its share goes to the cosine lobe.
     critical = 1.0 / (eta + ops.safe_sqrt(eta * eta - 1.0))
     trapped = width2 / (width2 + critical * critical)
     metal = _mean(fresnel_conductor_rgb(cos_t, Color(*stack.eta_bottom), Color(*stack.k_bottom)))
@@ -281,9 +291,10 @@ def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
 
 
 def pdf(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
-    """A density of wo [1/sr] similar to that of the walk, for importance sampling and for weighing estimators.
+    """A density of wo [1/sr] for importance sampling.
 
-    It is positive for wo.z > 0, and its integral is at most 1.
+    The density is similar to that of the random walk. It serves importance sampling and the weights of multiple
+    importance sampling. It is positive for wo.z > 0, and its integral is at most 1.
     """
     (coat, bottom, diffuse), width = lobes(stack, wi)
     inside_i, inside_o = refract_flat(wi, stack.eta_top), refract_flat(wo, stack.eta_top)
@@ -296,14 +307,15 @@ def pdf(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
 def sample(stack: Stack, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
     """Draws a direction with density `pdf` from three numbers uniform in [0, 1).
 
-    A direction that does not point up is an invalid sample.
+    If the direction does not point up, the sample is invalid.
     """
     (coat, bottom, _), width = lobes(stack, wi)
     on_coat, eta = u_lobe < coat, stack.eta_top
     view = ops.select(on_coat, _above(wi), refract_flat(wi, eta))
     alpha = ops.select(on_coat, stack.alpha_top, width)
     mirrored = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
-    # Light from the conductor leaves through a flat coat. Total internal reflection keeps oblique light inside.
+    # The direction is refracted out through a flat coat. If it is totally reflected inside the coat, the sample is
+    # invalid.
     cos2 = 1.0 - eta * eta * (1.0 - mirrored.z * mirrored.z)
     leaves = (mirrored.z > 0) & (cos2 > 0)
     seen = Vec3(mirrored.x * eta, mirrored.y * eta, ops.select(leaves, ops.safe_sqrt(cos2), -1.0))
@@ -314,7 +326,7 @@ def sample(stack: Stack, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
 
 
 def refract_flat(w: Vec3, eta: Float) -> Vec3:
-    """The direction `w` refracted into a flat coat of index `eta` (Snell's law), turned to point up."""
+    """The direction `w` refracted into a flat coat of index `eta` (Snell's law), mirrored to point up."""
     x, y = w.x / eta, w.y / eta
     return Vec3(x, y, ops.sqrt(ops.maximum(1.0 - x * x - y * y, 1e-7)))
 

@@ -1,4 +1,4 @@
-"""Lookup of numbers in a regular grid, for Dr.Jit lanes."""
+"""Looks up values in a regular grid, at one position per Dr.Jit lane."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from nma.ops import Float
 
 
 class Lookup:
-    """A regular grid in d dimensions. Its `cells` are an array of shape (n_1, ..., n_d, channels).
+    """A regular grid in d dimensions, whose `cells` are an array of shape (n_1, ..., n_d, channels).
 
-    A position is measured in cells: 0 .. n_k in dimension k. A `periodic` dimension wraps around. In the other
-    dimensions a position beyond an end means the cell at that end. Positions may be Dr.Jit arrays with or without
-    derivatives, so that one grid serves both tables and renderings.
+    A position is measured in cells: 0 .. n_k in dimension k. A `periodic` dimension wraps around. In any other
+    dimension, a position beyond an end is replaced by the position of that end. Positions may be of Dr.Jit types with
+    or without derivatives, so that tabulation and rendering can use the same grid.
     """
 
     def __init__(self, cells: NDArray, periodic: Sequence[bool]):
         *self._sizes, self._channels = cells.shape
         self._periodic = tuple(periodic)
-        # Dr.Jit loads the channels of a cell at once if their number is a power of two.
+        # Dr.Jit loads all channels of a cell at once if the number of channels is a power of two, so unused channels
+        # are added.
         self._packet = 1 << (self._channels - 1).bit_length()
         filled = np.zeros((*self._sizes, self._packet), np.float32)
         filled[..., : self._channels] = cells
@@ -35,11 +36,11 @@ class Lookup:
         self._loaded: dict[str, Any] = {}
 
     def nearest(self, position: Sequence[Float]) -> list[Float]:
-        """The numbers of the cell that contains the position, one array per channel."""
+        """The values of the cell that contains the position, one array per channel."""
         return self._gather([self._cell(k, dr.floor(x)) for k, x in enumerate(position)])
 
     def linear(self, position: Sequence[Float]) -> list[Float]:
-        """The numbers at the position, interpolated linearly between the cells' middles, one array per channel."""
+        """The values at the position, interpolated linearly between the middles of cells, one array per channel."""
         total = [0.0 * position[0]] * self._channels
         for corner in self._corners(position):
             weights, cells = zip(*corner, strict=True)
@@ -48,7 +49,7 @@ class Lookup:
         return total
 
     def _corners(self, position: Sequence[Float]) -> Iterator[tuple[tuple[Float, Any], ...]]:
-        """The 2^d cells around the position. Each is given as one pair (weight, index) per dimension."""
+        """The 2^d cells around the position. Each cell is given as one pair (weight, index) per dimension."""
         pairs = []
         for k, x in enumerate(position):
             low = dr.floor(x - 0.5)
@@ -57,14 +58,14 @@ class Lookup:
         return product(*pairs)
 
     def _cell(self, k: int, floor: Float) -> Any:
-        """The index of a cell in dimension `k`. `floor` may lie up to one cell beyond either end."""
+        """The index of a cell in dimension `k`, from a position `floor`, which may lie one cell beyond either end."""
         n, types = self._sizes[k], _types(floor)
         if self._periodic[k]:
             floor = dr.select(floor < 0, floor + n, dr.select(floor >= n, floor - n, floor))
         return types.UInt32(dr.clip(floor, 0, n - 1))
 
     def _gather(self, cells: Sequence[Any]) -> list[Float]:
-        """The numbers of the cells whose indices are given, one array of indices per dimension."""
+        """The values of the cells whose indices are given as one array per dimension."""
         index = cells[0]
         for size, cell in zip(self._sizes[1:], cells[1:], strict=True):
             index = index * size + cell
@@ -77,5 +78,5 @@ class Lookup:
 
 
 def _types(lanes: Any) -> Any:
-    """The Dr.Jit module that the type of the array `lanes` belongs to."""
+    """The Dr.Jit module that defines the type of the array `lanes`."""
     return import_module(type(lanes).__module__)

@@ -1,12 +1,12 @@
 """The `.binary` files of the MERL BRDF database: reading, evaluation, and writing from any isotropic source.
 
-Matusik et al. 2003, "A Data-Driven Reflectance Model". A file has three little-endian int32 (90, 90, 180), then three
-planes of float64 for red, green and blue. Within a plane phi_d varies fastest, then theta_d, then theta_h. The grid is
-uniform in the square root of theta_h and in the two other angles. Each channel has its own scale. A negative number
-means that the entry was not measured.
+The database is that of Matusik et al. 2003, "A Data-Driven Reflectance Model". A file has three little-endian int32
+(90, 90, 180), then three planes of float64 for red, green and blue. Within a plane phi_d varies fastest, then theta_d,
+then theta_h. The grid is uniform in the square root of theta_h, in theta_d and in phi_d. Each channel has its own scale
+(`SCALE`). A negative number means that the entry was not measured.
 
-The azimuths phi_d and phi_d + pi share an entry. Swapping view and light exchanges these azimuths, so the format
-assumes that materials are reciprocal.
+The azimuths phi_d and phi_d + pi share an entry. Exchanging view and light adds pi to phi_d, so the format assumes that
+materials are reciprocal.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from nma.sources.half_difference import angles, directions
 from nma.sources.lookup import Lookup
 
 SHAPE = (90, 90, 180)
-# f [1/sr] is the number in the file times these scales, for red, green and blue.
+# Factors for red, green and blue that convert a number in the file to f [1/sr].
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
 # The size of every file in bytes.
 BYTES = 12 + 3 * 8 * math.prod(SHAPE)
 
-# `Merl.of` gives no value to entries where the cosine of either direction is smaller: dividing f cos(theta_o) by
-# cos(theta_o) would lose too many digits there.
+# `Merl.of` marks an entry as not measured if the cosine of either direction is smaller than this, because the division
+# of f cos(theta_o) by cos(theta_o) would lose too many digits.
 _MIN_COS = 1e-4
 _NO_DATA = -1.0
 
@@ -43,11 +43,11 @@ _NO_DATA = -1.0
 class Merl:
     """A measured isotropic BRDF (`Values`).
 
-    `planes` (3, 90, 90, 180) float64 are the numbers of the file. The axes are channel, theta_h, theta_d and phi_d.
+    `planes` (3, 90, 90, 180) float64 are the numbers of the file, with the axes channel, theta_h, theta_d and phi_d.
 
-    The database's own reader rounds angles down to the index of an entry, so an entry stands for a whole cell. Here an
-    entry is the value in the middle of its cell. Between the middles, `eval` interpolates linearly, using only the
-    neighbours that were measured.
+    The database's own reader rounds angles down to the index of an entry, so for this reader an entry applies to a
+    whole cell of the grid. Here an entry is the value at the middle of its cell. Between the middles, `eval`
+    interpolates linearly, from measured entries only.
     """
 
     isotropic = True
@@ -86,8 +86,8 @@ class Merl:
     def of(values: Values) -> Merl:
         """Samples any isotropic source at MERL's resolution: each entry is the value at the middle of its cell.
 
-        The file cannot tell view and light apart, so an entry is the mean of f over both orders of the two directions.
-        This makes a source reciprocal even if it was not. Raises `SourceError` for anisotropic sources.
+        The file does not distinguish view and light, so an entry is the mean of f(wi, wo) and f(wo, wi). The result is
+        therefore reciprocal, even if the source is not. Raises `SourceError` for anisotropic sources.
         """
         if not values.isotropic:
             raise SourceError(f"{values.name}: MERL files hold isotropic materials, this one is anisotropic")
@@ -97,7 +97,8 @@ class Merl:
         light, view = directions(h * h * (0.5 * math.pi), d * (0.5 * math.pi), p * math.pi)
         seen = (light.z > _MIN_COS) & (view.z > _MIN_COS)
         dr.eval(*light, *view)
-        # Evaluate one order after the other: the second call uses the kernel that the first has compiled.
+        # The two orders of the directions are evaluated by separate calls, because the second call reuses the kernel
+        # that Dr.Jit compiles for the first call.
         f = 0.5 * (_brdf(values, view, light) + _brdf(values, light, view))
         planes = f.reshape(3, *SHAPE) / SCALE[:, None, None, None]
         return Merl(np.where(seen.numpy().reshape(SHAPE), planes, _NO_DATA), values.name)
@@ -119,7 +120,7 @@ def read(path: str | Path) -> NDArray[np.float64]:
 
 
 def _brdf(values: Values, wi: Vec3, wo: Vec3) -> NDArray[np.float32]:
-    """f (3, n) [1/sr], at least 0, since a negative number in a file means "not measured"."""
+    """f (3, n) [1/sr]. Negative values become 0, because a negative number in a file means "not measured"."""
     f = Color(*(ops.maximum(c, 0.0) for c in values.eval(wi, wo))) * (1.0 / ops.maximum(wo.z, _MIN_COS))
     dr.eval(*f)
     return np.stack([c.numpy() for c in f])
@@ -131,7 +132,7 @@ def _check_size(path: Path, content: bytes) -> None:
         raise SourceError(f"{path}: {len(content)} bytes are too short for a MERL file; copy it again")
     shape = tuple(np.frombuffer(content, "<i4", 3).tolist())
     if shape != SHAPE:
-        raise SourceError(f"{path}: its dimensions are {shape}, a MERL file has {SHAPE}")
+        raise SourceError(f"{path}: its dimensions are {shape}, but those of a MERL file are {SHAPE}")
     if len(content) != BYTES:
         what = "truncated" if len(content) < BYTES else "too long"
         raise SourceError(f"{path}: {what}, {len(content):,} bytes instead of {BYTES:,}; copy it again")

@@ -1,8 +1,8 @@
 """Any BSDF of Mitsuba 3 as a source: from a dictionary, from XML, or from a measured material of RGL's database.
 
-Only the light that the front side reflects counts. Transmitted light is left out, and so is the light that the back of
-a two-sided BSDF reflects. A perfectly specular reflection has no value at a pair of directions, so a BSDF with one is
-refused.
+A source includes only the light that the front side reflects. Transmitted light, and the light that the back of a
+two-sided BSDF reflects, are left out. A perfectly specular reflection has no value at a pair of directions, so a BSDF
+with such a reflection is rejected.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ from nma.sources import rgl
 from nma.sources.base import direction
 from nma.sources.files import Format
 
-# A BSDF is tested for isotropy at this many pairs of directions. Rounding explains relative changes up to `_ROUNDING`.
+# A BSDF is tested for isotropy at this many pairs of directions. Relative changes up to `_ROUNDING` are taken for
+# rounding errors.
 _PAIRS = 512
 _ROUNDING = 1e-3
-# Directions closer to the horizon are lifted to this cosine. If both lie at the horizon, on opposite sides, single
-# precision loses their half vector, and Mitsuba's measured and rough BSDFs return NaN.
+# A direction whose cosine is smaller than this is raised to this cosine. The reason: for two opposite directions at the
+# horizon, single precision cannot represent the half vector, and Mitsuba's measured and rough BSDFs return NaN.
 _MIN_COS = 1e-6
 
 
 class MitsubaBsdf:
-    """A Mitsuba BSDF (`Values`), tied to the Mitsuba variant in which it was made.
+    """A Mitsuba BSDF (`Values`), which can be used only in the Mitsuba variant in which it was made.
 
     If no variant is set yet, the constructor sets `cuda_ad_rgb` on a machine with a GPU, else `llvm_ad_rgb`. `bsdf` is
-    an instance of `mi.BSDF`. `uv` is the point where its textures are looked up. `isotropic` says whether the BSDF is
-    isotropic; if it is None, a test with turned pairs of directions decides. Raises `SourceError` for a BSDF with a
-    perfectly specular reflection, and `ParamError` if the variant is not vectorised or not RGB.
+    an instance of `mi.BSDF`. `uv` is the point at which the BSDF's textures are read. `isotropic` tells whether the
+    BSDF is isotropic; if `isotropic` is None, the constructor tests the BSDF with rotated pairs of directions. Raises
+    `SourceError` for a BSDF with a perfectly specular reflection, and `ParamError` if the variant is not vectorised or
+    not RGB.
     """
 
     def __init__(
@@ -50,7 +52,8 @@ class MitsubaBsdf:
         mi = choose_variant()
         if mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):
             raise SourceError(
-                f"{name}: reflects like a perfect mirror, which has no value; make it a little rough"
+                f"{name}: reflects like a perfect mirror, which has no value at a pair of directions; "
+                "make the material slightly rough"
             )
         self.bsdf, self.name, self._uv, self._variant = bsdf, name, uv, mi.variant()
         self.isotropic = self._is_isotropic() if isotropic is None else isotropic
@@ -74,7 +77,7 @@ class MitsubaBsdf:
         return Color(*(type(wi.z)(c) for c in plain))
 
     def _is_isotropic(self) -> bool:
-        """Whether values stay the same when both directions turn about the normal."""
+        """Whether values stay the same when both directions are rotated about the normal by the same angle."""
         rng = np.random.default_rng(0)
         mu_i, mu_o = rng.uniform(0.05, 0.95, (2, _PAIRS))
         phi_i, phi_o, turn = rng.uniform(0.0, 2.0 * np.pi, (3, _PAIRS))
@@ -86,7 +89,8 @@ class MitsubaBsdf:
 def from_dict(description: Mapping[str, Any], name: str | None = None, **options: Any) -> MitsubaBsdf:
     """The BSDF of a dictionary for `mi.load_dict`. The `options` are those of `MitsubaBsdf`.
 
-    Raises `SourceError` if Mitsuba cannot load the dictionary, or if it names a damaged file of a measured material.
+    Raises `SourceError` if Mitsuba cannot load the dictionary, or if the dictionary names a damaged file of a measured
+    material.
     """
     for filename in _measured_files(description):
         rgl.read(filename)
@@ -97,7 +101,7 @@ def from_dict(description: Mapping[str, Any], name: str | None = None, **options
 def from_xml(path: str | Path, **options: Any) -> MitsubaBsdf:
     """The BSDF of an XML file whose outermost element is <bsdf>. The `options` are those of `MitsubaBsdf`.
 
-    Raises `SourceError` as `from_dict` does.
+    Raises `SourceError` if there is no such file, and for the same faults as `from_dict`.
     """
     path = Path(path)
     if not os.path.isfile(path):
@@ -120,7 +124,7 @@ def measured(path: str | Path, **options: Any) -> MitsubaBsdf:
 
     Raises `SourceError` if the file is missing, damaged or spectral.
     """
-    # For Mitsuba, a file with at most two azimuths of incidence is isotropic.
+    # Mitsuba treats a material as isotropic if its file has at most two azimuths of incidence.
     isotropic = len(rgl.read(path)["phi_i"]) <= 2
     description = {"type": "measured", "filename": str(path)}
     options = {"isotropic": isotropic} | options
@@ -152,7 +156,7 @@ def _measured_in_xml(text: bytes) -> list[str]:
 
 
 def choose_variant() -> Any:
-    """The module `mitsuba` in a vectorised RGB variant. If no variant is set, sets the one for Dr.Jit's backend."""
+    """The module `mitsuba` in a vectorised RGB variant. If no variant is set, sets the variant of Dr.Jit's backend."""
     import mitsuba
 
     mi: Any = mitsuba  # its types change with the variant
@@ -180,7 +184,7 @@ def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> 
 
 
 def _interaction(mi: Any, wi: Any, uv: tuple[float, float]) -> Any:
-    """A point on a flat surface, seen from `wi`. It has a shading frame, which bump and normal maps need."""
+    """A point on a flat surface, seen from `wi`, with a shading frame, which bump and normal maps need."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
     si.wi = wi
     si.uv = mi.Point2f(*uv)

@@ -1,11 +1,12 @@
 """Neural BRDFs: one small network per material that maps a pair of directions to the BRDF's value.
 
-Sztrajman et al. 2021, "Neural BRDF Representation and Importance Sampling". The networks are reconstructions, not
-measurements. We call those fitted to MERL's materials NBRDF-MERL, and those fitted to RGL's materials NBRDF-RGL.
+The networks are those of Sztrajman et al. 2021, "Neural BRDF Representation and Importance Sampling". They are
+reconstructions, not measurements. We call the networks fitted to MERL's materials NBRDF-MERL, and the networks fitted
+to RGL's materials NBRDF-RGL.
 
 A weights file (`.npz`) has `names` (n,) and `weights` (n, 675). A row of weights has the matrices and biases of the
-network 6 -> 21 -> 21 -> 3 with ReLU, in the order k1 (6, 21), b1, k2 (21, 21), b2, k3 (21, 3), b3. A layer computes
-x @ k + b.
+network 6 -> 21 -> 21 -> 3 with ReLU, in the order k1 (6, 21), b1, k2 (21, 21), b2, k3 (21, 3), b3. A layer maps x to x
+@ k + b.
 """
 
 from __future__ import annotations
@@ -26,17 +27,21 @@ from nma.sources.half_difference import half_difference
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# The names of the measurements, each by one of its materials. A weights file with this material was fitted to them.
+# The names of the two published sets of networks. Each name is stored under a material that only that set contains, so
+# a weights file with this material belongs to the set.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
 class Nbrdf:
-    """One material's network (`Values`). It is reciprocal and symmetric only as far as it has learned to be."""
+    """One material's network (`Values`).
+
+    The network has learned reciprocity and symmetry, so both are only approximate.
+    """
 
     isotropic = True
 
     def __init__(self, weights: NDArray, name: str = "NBRDF"):
-        """`weights` (675,) are in the order of the file. Raises `SourceError` for another shape."""
+        """`weights` (675,) are in the order of the file. Raises `SourceError` if they have another shape."""
         if weights.shape != (WEIGHTS,):
             raise SourceError(f"{name}: an NBRDF network has {WEIGHTS} weights, got {weights.shape}")
         self.name = name
@@ -57,11 +62,11 @@ class Nbrdf:
 
     @staticmethod
     def load(path: str | Path, material: str) -> Nbrdf:
-        """The network of one material. Raises `SourceError` if the file is damaged or has no such material."""
+        """Reads the network of one material. Raises `SourceError` if the file is damaged or has no such material."""
         names, weights = read(path)
         if material not in names:
             raise SourceError(
-                f"{path}: no material '{material}' among its {len(names)}; {hint(material, names)}"
+                f"{path}: no material '{material}' among its {len(names)} materials; {hint(material, names)}"
             )
         return Nbrdf(weights[names.index(material)], f"{kind(names)} {material}")
 
@@ -72,7 +77,10 @@ def kind(names: list[str]) -> str:
 
 
 def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
-    """Names (n) and weights (n, 675) of a weights file. Raises `SourceError` if it is missing or damaged."""
+    """Reads names (n,) and weights (n, 675) from a weights file.
+
+    Raises `SourceError` if the file is missing or damaged.
+    """
     path = Path(path)
     try:
         with arrays(path) as f:
@@ -101,7 +109,7 @@ def _identify(path: Path) -> str:
 
 
 def _claims(path: Path) -> bool:
-    """Whether an `.npz` file has weights. Other files, such as tables, have none."""
+    """Whether an `.npz` file is a weights file. Other `.npz` files, such as tables, have no array `weights`."""
     try:
         with arrays(path) as f:
             return "weights" in f

@@ -1,9 +1,10 @@
 """The `.bsdf` files of RGL's material database. This module reads and checks them; Mitsuba's `measured` evaluates them.
 
-Dupuy and Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering". A file has a
-header and a set of named arrays. The header gives magic, version and number of fields, and for each field its name,
-rank, type, offset and shape. Mitsuba maps the file into memory without checking the offsets against its size, so it
-reads past the end of a truncated file. This is why files are checked here first.
+The database is that of Dupuy and Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and
+Rendering". A file has a header and a set of named arrays, called fields. The header has a magic string, the version and
+the number of fields. For each field the header has the name, rank, type, offset and shape. Mitsuba maps the file into
+memory without comparing the offsets with the file's size, so Mitsuba would read past the end of a truncated file. For
+this reason, this module checks a file before Mitsuba reads the file.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from nma.sources import files
 from nma.sources.files import Measurements
 
 _MAGIC = b"tensor_file\0"
-# NumPy types by their number in the file. Files of materials use no other numbers.
+# NumPy types by their code in the file. Files of materials use no other codes.
 _TYPES = {
     1: "<u1",
     2: "<i1",
@@ -34,7 +35,8 @@ _TYPES = {
     11: "<f8",
 }
 
-# The fields of a material in RGB and their ranks. `rgb` has the shape (phi_i, theta_i, 3, y, x).
+# The fields of an RGB material, and the rank (number of dimensions) of each field. `rgb` has the shape (phi_i, theta_i,
+# 3, y, x).
 _FIELDS = {
     "description": 1,
     "phi_i": 1,
@@ -49,7 +51,7 @@ _FIELDS = {
 
 
 def read(path: str | Path) -> dict[str, NDArray]:
-    """The arrays of a material in RGB, by name. Raises `SourceError` with the fault if the file is damaged."""
+    """Reads the arrays of an RGB material, by name. Raises `SourceError` with the fault if the file is damaged."""
     path = Path(path)
     fields = read_tensors(path)
     if "rgb" not in fields and "spectra" in fields:
@@ -58,9 +60,11 @@ def read(path: str | Path) -> dict[str, NDArray]:
         if name not in fields:
             raise SourceError(f"{path}: field '{name}' is missing; copy the file again")
         if fields[name].ndim != rank:
-            raise SourceError(f"{path}: field '{name}' has shape {fields[name].shape}, not {rank} dimensions")
+            raise SourceError(
+                f"{path}: field '{name}' has shape {fields[name].shape}, but must have {rank} dimensions"
+            )
         if fields[name].dtype.kind == "f" and not np.isfinite(fields[name]).all():
-            raise SourceError(f"{path}: field '{name}' is not finite; copy the file again")
+            raise SourceError(f"{path}: field '{name}' has values that are not finite; copy the file again")
     _check_shapes(path, fields)
     for name, low, high in (("phi_i", -2 * math.pi, 2 * math.pi), ("theta_i", 0.0, math.pi / 2)):
         _check_grid(path, name, fields[name], low, high)
@@ -68,11 +72,11 @@ def read(path: str | Path) -> dict[str, NDArray]:
 
 
 def read_tensors(path: str | Path) -> dict[str, NDArray]:
-    """All arrays of a tensor file, by name."""
+    """Reads all arrays of a tensor file, by name."""
     path = Path(path)
     content = files.content(path, "RGL")
     if content[:12] != _MAGIC:
-        what = "no tensor file" if content else "empty"
+        what = "not a tensor file" if content else "empty"
         raise SourceError(f"{path}: {what}; RGL's materials are files that end in _rgb.bsdf")
     try:
         return _parse(content)
@@ -84,14 +88,14 @@ def _parse(content: bytes) -> dict[str, NDArray]:
     """The arrays in the `content` of a tensor file, by name."""
     major, minor, count = struct.unpack_from("<BBI", content, 12)
     if (major, minor) != (1, 0):
-        raise ValueError(f"version {major}.{minor}")
+        raise ValueError(f"unknown version {major}.{minor}")
     at, fields = 18, {}
     for _ in range(count):
         (length,) = struct.unpack_from("<H", content, at)
         name = content[at + 2 : at + 2 + length].decode()
         rank, kind, offset = struct.unpack_from("<HBQ", content, at + 2 + length)
         if kind not in _TYPES:
-            raise ValueError(f"field '{name}' has type {kind}")
+            raise ValueError(f"field '{name}' has the unknown type {kind}")
         shape = struct.unpack_from(f"<{rank}Q", content, at + 13 + length)
         at += 13 + length + 8 * rank
         fields[name] = np.frombuffer(content, _TYPES[kind], math.prod(shape), offset).reshape(shape)
@@ -110,12 +114,12 @@ def _check_shapes(path: Path, fields: dict[str, NDArray]) -> None:
     for name, shape in expected.items():
         if fields[name].shape != shape:
             raise SourceError(
-                f"{path}: field '{name}' has shape {fields[name].shape}, expected {shape}; copy it again"
+                f"{path}: field '{name}' has shape {fields[name].shape}, but must have {shape}; copy the file again"
             )
 
 
 def _check_grid(path: Path, name: str, angles: NDArray, low: float, high: float) -> None:
-    """Raises `SourceError` if angles of incidence do not ascend or are out of range.
+    """Raises `SourceError` if the angles of incidence do not ascend, or are not in `low` .. `high`.
 
     Mitsuba finds an angle by bisection, which needs ascending angles.
     """
