@@ -1,7 +1,8 @@
-"""The command line: parse, call, print. No physics here.
+"""The command line `nma`: parses arguments, calls the other modules of the package, and prints results.
 
-Each command is a file of its name; several that share a word, as `nma library list`, are one file. A new command is one
-such file with a function `register`, and its name in `COMMANDS`.
+Each command is implemented in a file of the same name. Commands that share a first word, such as `nma library list` and
+`nma library encode`, are implemented in one file. To add a command, write a file with a function `register`, and add
+the file's name to `COMMANDS`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from nma.errors import NmaError, one_line
 
 
 class _Commands(TyperGroup):
-    """Ends with a message on Ctrl-C, where typer prints none."""
+    """The group of all commands. On Ctrl-C it prints a message, which typer does not."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -42,7 +43,8 @@ app = typer.Typer(
     "measured materials. [bold]library[/bold] adds materials to a library and takes some out. [bold]principled[/bold] "
     "fits one plain Principled BRDF. [bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
-# Files of this folder, each with the command or the group of its name, in the order of `nma --help`: commands first.
+# The files of this folder that define commands. `nma --help` lists single commands first and then groups of commands,
+# each in this order.
 COMMANDS = (
     "materials",
     "simulate",
@@ -80,7 +82,7 @@ def _options(
 
 
 def main() -> None:
-    """Entry point of the `nma` command: expected errors become one line on stderr and exit status 1."""
+    """The entry point of the program `nma`. Expected errors are printed as one line on stderr, with exit status 1."""
     try:
         try:
             app()
@@ -95,7 +97,7 @@ def main() -> None:
         _close_stdout()
         _fail(f"{e.filename}: {e.strerror}" if e.filename else str(e))
     except (MemoryError, RuntimeError) as e:
-        # Dr.Jit and JAX report a lack of memory as a RuntimeError.
+        # If memory runs out, Dr.Jit and JAX raise a RuntimeError.
         if isinstance(e, RuntimeError) and "out of memory" not in str(e).lower():
             raise
         _fail(
@@ -119,7 +121,11 @@ def _interrupted() -> NoReturn:
 
 
 def _close_stdout() -> None:
-    """Gives stdout up where it takes no more: Python would complain of the lost reader or full disk when it ends."""
+    """Redirects stdout to the null device if writing to stdout fails.
+
+    Writing fails if the reader of a pipe has ended or the disk is full. At its exit, Python flushes stdout and would
+    print another error.
+    """
     try:
         sys.stdout.flush()
     except OSError:

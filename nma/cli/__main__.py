@@ -1,4 +1,4 @@
-"""`python -m nma.cli` is the `nma` command."""
+"""Runs the program `nma` for `python -m nma.cli`."""
 
 from nma.cli import main
 

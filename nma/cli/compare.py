@@ -1,4 +1,4 @@
-"""`nma compare`: an image against another, or an adapter's picture against its reference's."""
+"""The command `nma compare`: compares two images, or a picture of an adapter with its reference."""
 
 from __future__ import annotations
 
@@ -48,10 +48,11 @@ def compare(
     seed: options.PictureSeed = 0,
     variant: options.MitsubaVariant = "auto",
 ) -> None:
-    """Compare two images. Or, for a material, render its adapter and its reference and compare those.
+    """Compare an image with a reference image, or compare two renderings of a material.
 
-    The reference of a material is rendered twice. The column `noise` compares these two pictures, which differ by their
-    noise alone. The figures are defined in docs/evaluation.md.
+    For a material, the command compares a picture rendered by its adapter with a picture rendered by the reference
+    simulation. The reference is rendered twice, with different seeds. The column `noise` compares the two pictures of
+    the reference, which differ only by their noise. The figures are defined in docs/evaluation.md.
 
     Examples: [bold]nma compare test.exr reference.exr -o difference.png[/bold],
     [bold]nma compare gold-red-lacquer --spp 512[/bold]
@@ -71,7 +72,8 @@ def compare(
         material, adapter = preview.subject(context, test, changes, adapter)
         if not material.values:
             raise ParamError(
-                f"{test}: its material cannot be simulated; render both yourself and compare the images"
+                f"{test}: this material cannot be simulated, so there is no reference; "
+                "render both pictures yourself and compare the images"
             )
         view = preview.View(pixels, spp, depth, camera, lighting, envmap, variant)
         pictures = _renderings(material, view, seed, adapter, clamp)
@@ -94,7 +96,7 @@ def compare(
 def _renderings(
     material: Material, view: preview.View, seed: int, adapter: str, clamp: bool
 ) -> dict[str, Any]:
-    """Pictures of a material: one by its adapter, two by its reference. Each has its own seed."""
+    """Renders a material once with its adapter and twice with its reference, each time with another seed."""
     by_adapter = view.load(material, "nma", adapter, clamp)
     by_walks = view.load(material, "layered")
     return {

@@ -1,4 +1,4 @@
-"""What the commands share: progress bars on stderr, tables on stdout."""
+"""Functions that the commands share to print progress bars on stderr and tables on stdout."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ __all__ = ["TrainingBar", "counting", "err", "loss_plot", "number", "out", "prog
 out = Console()
 
 _GAP = 2
-# A cell longer than this is a sentence, which may be broken between words.
+# A cell with more characters than this is a sentence, whose line may be broken between words.
 _SENTENCE = 24
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None) -> Group:
-    """A table that fits the terminal. Sentences are broken between words, numbers never.
+    """Returns a table that fits the width of the terminal. Sentences are broken between words; numbers are not broken.
 
-    Columns that do not fit go into a second table below, then a third. Each repeats the first column. Brackets are
-    printed as they are: they are no markup.
+    Columns that do not fit go into more tables below the first, and each of these tables repeats the first column.
+    Brackets in a cell are printed as text and not interpreted as markup.
     """
     cells = [[number(cell) if isinstance(cell, float) else str(cell) for cell in row] for row in rows]
     columns = [
@@ -40,12 +40,12 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str 
 
 
 def say(text: str) -> None:
-    """Prints a line on stderr as it is. Long paths stay in one piece, and brackets are no markup."""
+    """Prints a line on stderr unchanged: long paths are not broken, and brackets are not interpreted as markup."""
     err.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 def tell(text: str) -> None:
-    """Prints a line on stdout, as `say` does on stderr."""
+    """Prints a line on stdout unchanged, as `say` does on stderr."""
     out.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
@@ -53,10 +53,10 @@ def tell(text: str) -> None:
 def counting(
     title: str, total: int, unit: str, before: int = 0, digits: int = 1
 ) -> Iterator[Callable[..., Any]]:
-    """A progress bar that counts to `total`, from `before`, with a rate in `unit`.
+    """Shows a progress bar that counts from `before` to `total`, with a rate in `unit`.
 
-    Call what it yields with the count so far and the work since the start. It returns the rate, work per second.
-    `note` and `description` may change with each call.
+    Yields a function that updates the bar. Its arguments are the count so far and the work done since the start, and
+    optionally a new `note` or `description` of the bar. It returns the rate, which is the work per second.
     """
     with progress(unit) as bar:
         task = bar.add_task(title, total=total, completed=before, rate="", note="")
@@ -71,18 +71,18 @@ def counting(
 
 
 def number(value: float) -> str:
-    """A number as text: with four digits, .01382, or with two where it is tiny, 6.5e-06."""
+    """Formats a number with four significant digits (.01382), or with two if it is smaller than 1e-4 (6.5e-06)."""
     text = f"{value:.4g}" if abs(value) >= 1e-4 or value == 0 else f"{value:.1e}"
     return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text
 
 
 def loss_plot(output: Path) -> Path:
-    """The file for a plot of the losses of training. It lies beside the weights, `output`."""
+    """The file for the plot of the training loss, in the folder of the weights file `output`."""
     return output.with_suffix(".loss.png")
 
 
 class _Column:
-    """A column of a table. It needs at least `width` letters."""
+    """A column of a table, and `width`, the smallest number of characters in which the column fits."""
 
     def __init__(self, heading: str, cells: Sequence[str], first: bool):
         widest = max(map(cell_len, cells), default=0)
@@ -96,7 +96,7 @@ class _Column:
 
 
 def _parts(columns: Sequence[_Column]) -> list[list[_Column]]:
-    """The columns after the first, divided among as few tables as can hold them."""
+    """Divides all columns except the first among as few tables as possible, so that each table fits the terminal."""
     parts: list[list[_Column]] = [[]]
     room = out.width - columns[0].width
     for column in columns[1:]:

@@ -1,4 +1,4 @@
-"""`nma data`: measured materials and their reconstructions. Where do they come from, and is a copy sound?"""
+"""The command `nma data`: lists the known measured materials and their origins, checks files, and writes MERL files."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def listing(context: typer.Context) -> None:
 
 @data.command()
 def check(path: Annotated[Path, typer.Argument(help="A file, or a folder with files.")]) -> None:
-    """Check files of measurements: their size, structure, values and, where it is known, checksum.
+    """Check files of measurements: their size, structure, values and, if it is known, checksum.
 
-    The exit status is 1 if a file has a fault.
+    The exit status is 1 if any file has a fault.
     """
     from nma.sources import catalogue
 

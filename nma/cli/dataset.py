@@ -1,4 +1,4 @@
-"""`nma dataset`: a class sampled into many tables."""
+"""The command `nma dataset`: simulates tables of many random materials of a class, for training."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ def dataset(
         str, options.choice("Where conductors come from.", *options.POPULATIONS[:-1])
     ] = "mixed",
 ) -> None:
-    """Sample a class into a dataset for training. If killed, run it again. Several runs may fill it together."""
+    """Simulate tables of many random materials of a class, as a dataset for training.
+
+    If a run is killed, the same command continues it. Several runs may write to one dataset at the same time.
+    """
     from nma.table.dataset import Dataset, Settings
 
     files.try_folder(output)
@@ -47,7 +50,7 @@ def dataset(
 
 
 def _span(seconds: float) -> str:
-    """A time in the largest unit of which it has at least two."""
+    """Formats a time in the largest unit (days, hours, minutes or seconds) in which its value is at least 2."""
     for unit, size in (("days", 86_400), ("hours", 3600), ("minutes", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.1f} {unit}"

@@ -1,4 +1,4 @@
-"""`nma demo`: reference and adapter side by side."""
+"""The command `nma demo`: renders two materials with the reference and with the adapter, side by side."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ def demo(
     reference_spp: Annotated[int, options.samples("Samples per pixel of the converged reference.")] = 144,
     variant: options.MitsubaVariant = "auto",
 ) -> None:
-    """See it work: two layered materials, by reference and by adapter, with time, variance and error.
+    """Render two layered materials with the reference and with the adapter, and measure time, variance and error.
 
-    One of the materials is plain, the other is textured. The command writes a sheet of pictures, again whenever there
-    is more to show, and prints its figures as a table. It takes about a minute on two CPU cores.
+    The first material has no textures, and the second material has three. The command writes a sheet of pictures as
+    soon as the first pictures are rendered, and writes the sheet again with more results. It prints the time, variance
+    and error as a table. The command takes about a minute on two CPU cores.
     """
     from nma.images import metrics
 

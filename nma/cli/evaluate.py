@@ -1,4 +1,4 @@
-"""`nma evaluate`: an adapter against reference tables."""
+"""The command `nma evaluate`: compares an adapter with reference tables."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print nothing but JSON on stdout.")] = False,
     clamp: options.Clamp = False,
 ) -> None:
-    """Compare an adapter with reference tables, bin by bin: one line of figures per material, and their means.
+    """Compare an adapter with reference tables, bin by bin: prints the errors of each material, and their means.
 
-    The adapter's bin averages are integrated numerically. The line below the table says how exact they are. The
-    formulas of the figures are in docs/evaluation.md.
+    The averages of the adapter over the bins are integrated numerically. The line below the printed table gives the
+    error of this integration. docs/evaluation.md defines the printed errors.
     """
     from nma.adapter import Adapter
     from nma.evaluate import evaluate as run
@@ -55,5 +55,5 @@ def evaluate(
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
-    """The figures for JSON. It has no infinity, so the PSNR of equal tables becomes null."""
+    """The figures for JSON. JSON cannot express infinity, so the infinite PSNR of equal tables becomes null."""
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}

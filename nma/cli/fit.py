@@ -1,4 +1,4 @@
-"""`nma fit`: an adapter for one material."""
+"""The command `nma fit`: trains an adapter for a single material."""
 
 from __future__ import annotations
 
@@ -46,7 +46,9 @@ def fit(
     learning_rate: options.Rate = None,
     seed: options.TrainingSeed = 0,
 ) -> None:
-    """Train a small network on one material alone: on its values or on its table. See docs/bring-your-own.md.
+    """Train a small network for a single material, from values of its BRDF or from its table.
+
+    docs/bring-your-own.md describes the sources of BRDF values.
 
     Examples: [bold]nma fit gold-red-lacquer -o gold.safetensors[/bold],
     [bold]nma fit paper_white_rgb.bsdf -o paper.safetensors[/bold]
@@ -83,7 +85,10 @@ def fit(
 
 
 def _space(source: str, tables: Tables) -> ParamSpace | None:
-    """The class of the table's parameters. A reference file does not name it, but the number of columns may tell."""
+    """The class of the table's parameters, or None if it is unknown.
+
+    A reference file does not name its class, so a class is chosen only if no other class has as many parameters.
+    """
     from nma import materials, sources
 
     if reading.is_material(source):
@@ -94,7 +99,7 @@ def _space(source: str, tables: Tables) -> ParamSpace | None:
 
 
 def _compare(adapter, source) -> None:
-    """Prints how far the adapter is from its source, which has values."""
+    """Prints the error of the adapter against the BRDF values of its source."""
     from nma.adapter.values import AdapterValues
     from nma.evaluate.pairs import PAIRS, compare
 

@@ -1,4 +1,4 @@
-"""`nma info`: what a weights file says about itself."""
+"""The command `nma info`: prints the contents of a weights file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def info(
     weights: Annotated[str | None, typer.Argument(help="A shipped adapter's name or a weights file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show what a weights file says about itself: class, network, ranges, training. Or list the shipped adapters."""
+    """Print the class, the network, the ranges and the training of a weights file; or list the shipped adapters."""
     from nma import network
     from nma.adapter import Adapter, shipped
     from nma.target.principled import DIALECT
@@ -63,7 +63,7 @@ def info(
 
 
 def _plain(value: Any) -> str:
-    """A fact as people read it: numbers of four digits, lists without brackets."""
+    """Formats a value for printing: numbers with four significant digits, lists without brackets."""
     if isinstance(value, float):
         return console.number(value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""`nma train-library`, `nma library`: many materials in one network, each with a code."""
+"""The commands `nma train-library` and `nma library`: libraries, in which many materials share one network."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def train_library(
     learning_rate: options.Rate = None,
     seed: Annotated[int, options.seed("Seed of codes, weights and batches.")] = 0,
 ) -> None:
-    """Train one small network on many materials, with a code for each: a library (paper Fig. 12).
+    """Train a library: one small network for many materials, and a code for each material (paper Fig. 12).
 
-    If killed, run it again: it goes on from the tables in OUTPUT.tables and the checkpoint OUTPUT.ckpt.
+    If a run is killed, the same command continues from the tables in OUTPUT.tables and the checkpoint OUTPUT.ckpt.
 
     Example: [bold]nma train-library ~/merl -o library.safetensors[/bold]
     """
@@ -79,7 +79,7 @@ def train_library(
 
 @library.command("list")
 def listing(path: _Library) -> None:
-    """List the materials of a library."""
+    """List the names of the materials of a library."""
     from nma.adapter.library import Library
 
     for name in Library.load(path).names:
@@ -99,7 +99,7 @@ def encode(
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the batches.")] = 0,
 ) -> None:
-    """Learn the code of a material that the library has not seen. The network stays as it is.
+    """Find the code of a new material, and write a library that also contains it. The network does not change.
 
     Example: [bold]nma library encode library.safetensors paper_white_rgb.bsdf -o more.safetensors[/bold]
     """
@@ -113,7 +113,9 @@ def encode(
     known = Library.load(path)
     name = name or material or source.stem
     if name in known.names:
-        raise ParamError(f"{path} has a material '{name}'; give the new one another name with --name")
+        raise ParamError(
+            f"{path} already has a material '{name}'; give the new material another name with --name"
+        )
     values = sources.read(source, material)
     with console.err.status(f"tabulating {values.name}"):
         tables = tabulate_values(values)
@@ -138,7 +140,7 @@ def extract(
     ],
     output: options.Weights,
 ) -> None:
-    """Write one material of a library, or a mixture of several, as an adapter of its own.
+    """Write one material of a library, or a mixture of several materials, as an adapter for a single material.
 
     Example: [bold]nma library extract library.safetensors brass=.7 blue-rubber=.3 -o mixed.safetensors[/bold]
     """
@@ -153,7 +155,7 @@ def extract(
 
 
 def _share(text: str) -> tuple[str, float]:
-    """A material and its weight in a mixture."""
+    """Parses NAME=WEIGHT: a material of the library and its weight in a mixture. Without =WEIGHT, the weight is 1."""
     name, equals, number = text.partition("=")
     try:
         return name, float(number) if equals else 1.0

@@ -1,4 +1,4 @@
-"""`nma materials`: the named materials, and what a material file says."""
+"""The command `nma materials`: lists the named materials, or prints the parameters of one material."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def materials(
         ),
     ] = False,
 ) -> None:
-    """List the named materials, or show one of them."""
+    """List the named materials, or print the parameters of one material."""
     from nma import materials as named
 
     if name is None:
@@ -57,7 +57,10 @@ def materials(
 
 
 def _facts(material: Material) -> dict[str, Any]:
-    """A material for other programs. `parameters` is its vector in the order of the class, None if it has images."""
+    """A material as JSON data for other programs.
+
+    `parameters` is the parameter vector in the order of the class, or None if a parameter comes from an image.
+    """
     from nma.materials import Texture
 
     values = {

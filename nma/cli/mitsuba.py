@@ -1,4 +1,4 @@
-"""`nma mitsuba`: plugins for Mitsuba's scalar renderer."""
+"""The command `nma mitsuba`: compiles plugins for Mitsuba's scalar renderer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ def register(app: typer.Typer) -> None:
 
 @mitsuba.command()
 def build() -> None:
-    """Compile the BSDFs nma and layered for scalar_rgb and the installed Mitsuba. It takes about ten seconds, once."""
+    """Compile the BSDFs nma and layered as plugins for the variant scalar_rgb of the installed Mitsuba.
+
+    The compilation takes about ten seconds, and is skipped if the plugins exist already.
+    """
     from nma.native import build
 
     folder = build.build_mitsuba(console.say)

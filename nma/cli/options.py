@@ -1,4 +1,4 @@
-"""Options that several commands share. Each number is declared with its smallest and its largest value."""
+"""Options that several commands share. The option of every number declares its smallest and its largest value."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from nma.errors import either
 
 
 def number(help: str, low: float, high: float, **more: Any) -> Any:
-    """A number between two bounds, both included. NaN is refused."""
+    """An option for a number from `low` to `high`, both included. NaN is rejected."""
     return typer.Option(min=low, max=high, help=help, callback=_no_nan, **more)
 
 
 def _no_nan(value: float | None) -> float | None:
-    """Refuses NaN, which some versions of typer let through whatever the bounds."""
+    """Rejects NaN, which some versions of typer accept although it is not within the bounds."""
     if value is not None and value != value:
-        raise typer.BadParameter("NaN is no number between the bounds")
+        raise typer.BadParameter("NaN is not a number between the bounds")
     return value
 
 
@@ -31,7 +31,7 @@ def seed(help: str) -> Any:
 
 
 def samples(help: str, **more: Any) -> Any:
-    """A number of samples per pixel."""
+    """An option for the number of samples per pixel."""
     return number(help, 1, 2**16, **more)
 
 
@@ -40,7 +40,7 @@ def exposure(help: str) -> Any:
 
 
 def choice(help: str, *values: str) -> Any:
-    """One of the words `values`."""
+    """An option whose value is one of the words `values`."""
 
     def check(value: str | None) -> str | None:
         if value is not None and value not in values:
@@ -51,7 +51,7 @@ def choice(help: str, *values: str) -> Any:
 
 
 def output(help: str, *endings: str, **more: Any) -> Any:
-    """A file to write. Its name must have one of the endings that the readers of such files accept."""
+    """The option --output: a file to write, whose name must end in one of `endings`."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None and path.suffix not in endings:
@@ -62,7 +62,7 @@ def output(help: str, *endings: str, **more: Any) -> Any:
 
 
 def _network(name: str | None) -> str | None:
-    """Refuses a wrong network at once, before a material is simulated for it."""
+    """Rejects an invalid network size when the arguments are parsed, before a long simulation starts."""
     if name is not None:
         from nma.network import hidden
 
@@ -70,12 +70,13 @@ def _network(name: str | None) -> str | None:
     return name
 
 
-# The words that `nma.train.recipe.Recipe` and `nma.params` declare.
+# The allowed words of options, which must be those that `nma.train.recipe.Recipe` and `nma.params` declare.
 TARGETS = ("principled", "stretched", "measured", "anisotropic")
 POINTS_LAWS = ("crowded", "uniform", "centre")
 LOSSES = ("huber", "log")
 POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
-# The paper's variants: how many instances there are, and whether they follow the view direction.
+# The paper's variants of the target. Each has the number of Principled BRDFs in the blend, and whether their parameters
+# depend on the view direction.
 VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
 
 # Options of commands that train.

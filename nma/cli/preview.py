@@ -1,4 +1,4 @@
-"""The preview scene: what `nma render`, `compare` and `demo` show there, and how."""
+"""Options and functions with which the commands `nma render`, `compare` and `demo` render the preview scene."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from nma.errors import ParamError
 if TYPE_CHECKING:
     from nma.materials import Material
 
-# The parameters of commands that say what the preview scene shows, and how.
+# The names of the command-line parameters that set what the preview scene shows, and with which light and camera.
 OPTIONS = ("adapter", "clamp", "changes", "camera", "lighting", "envmap", "mesh", "mesh_up", "depth")
 
 
 class View(NamedTuple):
-    """How the preview scene is shown: size, samples, light, camera, and the mesh in it."""
+    """Settings of the preview scene: size in pixels, samples per pixel, path depth, camera, light, and mesh."""
 
     size: tuple[int, int]
     spp: int
@@ -35,7 +35,7 @@ class View(NamedTuple):
     mesh_up: str = "z"
 
     def load(self, material: Material, model: str, adapter: str = "", clamp: bool = False) -> Any:
-        """The preview scene with this material."""
+        """Loads the preview scene with this material."""
         from nma.render import load, progressive, scene
 
         use_rgb(self.variant)
@@ -49,20 +49,21 @@ class View(NamedTuple):
 
 
 def use_rgb(variant: str) -> None:
-    """Chooses Mitsuba's variant. It must be RGB, as the parameters of materials are."""
+    """Sets Mitsuba's variant, which must be an RGB variant because the parameters of materials are RGB."""
     import nma.render
 
     if not variant.endswith("_rgb") and variant != "auto":
-        raise ParamError(f"materials are rendered in RGB, not by {variant}; take llvm_ad_rgb or cuda_ad_rgb")
+        raise ParamError(f"materials are rendered in RGB, not by {variant}; use llvm_ad_rgb or cuda_ad_rgb")
     nma.render.use(variant)
 
 
 def subject(
     context: typer.Context, name: str, changes: list[str] | None, adapter: str
 ) -> tuple[Material, str]:
-    """The material to show, and the adapter that shows it. An adapter of a single material is both.
+    """The material that the user named, and the adapter that renders it.
 
-    Options that would do nothing for it are wrong usage.
+    The user may also name a weights file of an adapter for a single material, which then gives the material and the
+    adapter. Options that would have no effect are rejected as wrong usage.
     """
     refuse(context, ("define",), "a material")
     if context.params["envmap"]:
@@ -76,7 +77,7 @@ def subject(
 
 
 def render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) -> Any:
-    """The image of a scene, behind a progress bar."""
+    """Renders a scene, shows a progress bar meanwhile, and returns the image."""
     from nma.render.progressive import render_passes
 
     with samples_bar(title, spp) as advance:
@@ -85,7 +86,11 @@ def render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) 
 
 @contextmanager
 def samples_bar(title: str, total: int) -> Iterator[Callable[[str, int], None]]:
-    """A progress bar over samples per pixel. Call what it yields with what goes on and the samples just done."""
+    """Shows a progress bar that counts samples per pixel.
+
+    Yields a function that updates the bar. Its arguments are a description of the current step, and the number of
+    samples per pixel that were rendered since the last call.
+    """
     done = 0
     with console.counting(title, total, "spp/s") as show:
 
@@ -98,7 +103,7 @@ def samples_bar(title: str, total: int) -> Iterator[Callable[[str, int], None]]:
 
 
 def pixels(text: str) -> tuple[int, int]:
-    """Width and height from `512` or `512x384`."""
+    """Parses a size such as `512` or `512x384` and returns the width and height in pixels."""
     from nma.render.progressive import check_size
 
     found = re.fullmatch(r"([1-9]\d{0,8})(?:x([1-9]\d{0,8}))?", text.lower(), re.ASCII)
@@ -113,7 +118,7 @@ def pixels(text: str) -> tuple[int, int]:
 
 
 def refuse(context: typer.Context, names: tuple[str, ...], subject: str) -> None:
-    """Refuses the options that would do nothing for this subject, if the user gave them."""
+    """Rejects those of the options `names` that the user gave, because they have no effect for `subject`."""
     given = [name for name in names if _given(context, name)]
     if given:
         flags = ", ".join("--set" if name == "changes" else f"--{name.replace('_', '-')}" for name in given)

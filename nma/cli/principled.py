@@ -1,4 +1,4 @@
-"""`nma principled`: a material as one plain Principled BRDF, for renderers that have nothing else."""
+"""The command `nma principled`: fits one Principled BRDF to a material, for renderers that cannot run an adapter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nma.cli import console, options, reading
 if TYPE_CHECKING:
     from nma.target import Principled
 
-# A mean error of the directional albedo above this shows in pictures, so a warning is printed.
+# If the mean error of the directional albedo is above this limit, it is visible in pictures, so a warning is printed.
 ALBEDO_LIMIT = 0.05
 
 
@@ -31,7 +31,8 @@ def _json(fitted: Principled) -> str:
     return principled_json(fitted)
 
 
-# The text of a file for a renderer, by the ending of its name. These functions import late: `nma --help` must be quick.
+# For each ending of an output file's name, the function that returns the content of the file. These functions contain
+# their own imports, so that `nma --help` is quick.
 _TEXTS: dict[str, Callable[[Principled], str]] = {".xml": _xml, ".json": _json}
 
 
@@ -65,9 +66,10 @@ def principled(
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the walks and of the batches.")] = 0,
 ) -> None:
-    """Fit one plain Principled BRDF to a material, and print its parameters as a dictionary for Mitsuba.
+    """Fit one Principled BRDF with constant parameters to a material, and print them as a dictionary for Mitsuba.
 
-    There is no network, no blend and no dependence on the direction: any renderer with such a BRDF takes the numbers.
+    The fit uses no network and no blend, and the parameters do not depend on the direction, so that any renderer with a
+    Principled BRDF can use them.
 
     Examples: [bold]nma principled gold-red-lacquer -o gold.xml[/bold],
     [bold]nma principled paper_white_rgb.bsdf[/bold]
@@ -99,10 +101,10 @@ def principled(
 
 
 def _warning(error: float, brightness: float) -> str:
-    """The warning for a fit that cannot show the material."""
+    """The text of the warning that is printed if the albedo error of a fit is above `ALBEDO_LIMIT`."""
     percent = 100.0 * (brightness - 1.0)
     tone = "bright" if percent > 0 else "dark"
     return (
         f"warning: an albedo error of {error:.4f} is above {ALBEDO_LIMIT:g} ({abs(percent):.1f} % too {tone} in all): "
-        "one plain Principled BRDF cannot show this material; an adapter can, which `nma fit` makes"
+        "one Principled BRDF with constant parameters cannot match this material; `nma fit` trains an adapter that can"
     )

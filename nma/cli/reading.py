@@ -1,4 +1,4 @@
-"""Reads what the arguments of commands name: a MATERIAL with its changes, or the SOURCE of one material."""
+"""Parses the arguments MATERIAL and SOURCE of the commands, and loads the material or source that they name."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 
 def material_of(name: str, changes: list[str] | None) -> Material:
-    """A named material, a material file, or the material of an adapter that knows a single one.
+    """Loads a named material, a material file, or the material of an adapter for a single material.
 
-    `changes` are those of --set, which change a material but not an adapter. Raises `NmaError` for what cannot be read.
+    `changes` are the values of the option --set. They change a named material or a material file, and are ignored for
+    an adapter. Raises `NmaError` if a file cannot be read.
     """
     from nma import materials
     from nma.adapter import Adapter
@@ -45,14 +46,14 @@ def material_of(name: str, changes: list[str] | None) -> Material:
 def known_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Values | Tables, dict[str, Any]]:
-    """What is known of one material, and the record of its origin.
+    """The table or the BRDF values of one material, and a record of where they come from.
 
-    A named material or a material file (.toml) is simulated with so many `walks`: its table is known. So is the table
-    in a reference file (.npz). A file that `nma.sources.read` reads has values. `material` chooses from a file of
-    several materials: the name of an NBRDF network, or the number of a table.
+    A named material or a material file (.toml) is simulated with `walks` random walks, which gives a table. A reference
+    file (.npz) contains a table. Any other file that `nma.sources.read` can read gives BRDF values. If a file has
+    several materials, `material` selects one: by the name of an NBRDF network, or by the index of a table.
 
-    The record has `data` (kind and name of the source), `material` (its name) and, for tables, `walks_per_material`.
-    Raises `NmaError` for what cannot be read.
+    The record has the entries `data` (the kind and the name of the source), `material` (the name of the material) and,
+    for tables, `walks_per_material`. Raises `NmaError` if a file cannot be read.
     """
     path = _path(source, material)
     if path.suffix == ".npz":
@@ -65,10 +66,10 @@ def known_of(
 def tables_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Tables, dict[str, Any]]:
-    """The table of one isotropic material, and the record of its origin, as `known_of` gives them.
+    """The table of one isotropic material, and the record of its origin, as `known_of` returns them.
 
-    Values are averaged over bins. The record then has the number of points in each, `points_per_bin`. Raises
-    `SourceError` for anisotropic materials.
+    If the source has BRDF values, they are averaged over the bins of a table, and the record also has the number of
+    points in each bin, `points_per_bin`. Raises `SourceError` for anisotropic materials.
     """
     from nma.table import Tables
     from nma.table.values import POINTS, tabulate_values
@@ -85,12 +86,13 @@ def tables_of(
 
 
 def values_of(source: str, material: str | None, adapter: str, clamp: bool = False) -> Values:
-    """A source with a value at any pair of directions.
+    """The source that `source` names, which has a BRDF value at every pair of directions.
 
-    It is a file of values, the adapter of a single material (.safetensors), or a named material or a material file
-    (.toml) as `adapter` shows it. `clamp` moves its parameters into the training range of that adapter.
+    `source` is a file of BRDF values, a weights file (.safetensors) of an adapter for a single material, or a named
+    material or a material file (.toml). The BRDF of a named material or a material file is computed by the adapter
+    `adapter`. `clamp` moves the material's parameters into the training range of this adapter.
 
-    Raises `NmaError` for what cannot be read, and for tables: they hold means over bins.
+    Raises `NmaError` if a file cannot be read, and if it is a reference file, because a table has only means over bins.
     """
     from nma import materials
     from nma.adapter import Adapter
@@ -99,7 +101,7 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
     path = _path(source, material)
     if path.suffix == ".npz" and path.is_file() and _holds_tables(path):
         raise TableError(
-            f"{path}: holds tables, whose bins are too wide; fit an adapter first: nma fit {path} -o X.safetensors"
+            f"{path} holds tables, whose bins are too wide; fit an adapter first: nma fit {path} -o X.safetensors"
         )
     if path.suffix == ".safetensors":
         return AdapterValues(Adapter.load(path), name=path.stem)
@@ -110,7 +112,7 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
 
 
 def is_material(source: str) -> bool:
-    """Whether this is a MATERIAL, by its name or by that of its file."""
+    """Whether `source` is the name of a named material or the path of a material file (.toml)."""
     from nma import materials
 
     return Path(source).suffix in ("", ".toml") or source in materials.names()
@@ -119,7 +121,9 @@ def is_material(source: str) -> bool:
 def _path(source: str, material: str | None) -> Path:
     path = Path(source)
     if material is not None and path.suffix != ".npz":
-        raise typer.BadParameter(f"--material chooses in .npz files; {source} is a single material")
+        raise typer.BadParameter(
+            f"--material selects a material of an .npz file, but {source} is a single material"
+        )
     return path
 
 
@@ -159,28 +163,28 @@ def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]
 
 
 def _number(path: Path, count: int, material: str | None) -> int:
-    """Which material of a reference file is meant."""
+    """The index of the material that `material` selects from a reference file with `count` materials."""
     if material is None and count == 1:
         return 0
     if material is None or not re.fullmatch(r"\d{1,9}", material, re.ASCII) or int(material) >= count:
         given = "" if material is None else f", not {material!r}"
         raise TableError(
-            f"{path}: holds {count} material(s); choose one with --material 0 .. {count - 1}{given}"
+            f"{path} contains {count} material(s); choose one with --material 0 .. {count - 1}{given}"
         )
     return int(material)
 
 
 def _holds_tables(path: Path) -> bool:
-    """Whether an .npz file is a reference file. Files of NBRDF networks have other arrays."""
+    """Whether an .npz file is a reference file. A file of NBRDF networks is not; it has an array `weights`."""
     try:
         with arrays(path) as f:
             return "weights" not in f
-    except Exception:  # the reader will say what is wrong
+    except Exception:  # a damaged file, whose fault the function that reads it reports
         return True
 
 
 def change_of(text: str) -> tuple[str, Any]:
-    """Name and value of a change such as `alpha_top=.2`; the value is one that a material file may have."""
+    """Parses a change such as `alpha_top=.2` and returns the name and the value, in the form of a material file."""
     name, value = assignment(text)
     try:
         numbers = [float(part) for part in value.split(",")]
@@ -190,7 +194,7 @@ def change_of(text: str) -> tuple[str, Any]:
 
 
 def _texture(text: str) -> dict[str, Any]:
-    """`orm.png,channel=g,uv_scale=4` as a table of a material file. The file's name may have commas."""
+    """Parses `orm.png,channel=g,uv_scale=4` to the TOML table of a texture. The image's name may contain commas."""
     from nma.materials import TEXTURE_OPTIONS
 
     file, *parts = re.split(rf",(?=(?:{'|'.join(TEXTURE_OPTIONS)})=)", text)
@@ -205,7 +209,7 @@ def _option(text: str) -> Any:
 
 
 def assignment(text: str) -> tuple[str, str]:
-    """Name and value of `NAME=VALUE`."""
+    """Parses `NAME=VALUE` and returns the name and the value."""
     name, equals, value = text.partition("=")
     if not (equals and name and value):
         raise typer.BadParameter(f"'{text}' is not of the form NAME=VALUE")

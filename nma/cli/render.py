@@ -1,4 +1,4 @@
-"""`nma render`: a picture of a material or of a scene."""
+"""The command `nma render`: renders a picture of a material or of a scene."""
 
 from __future__ import annotations
 
@@ -74,10 +74,10 @@ def render(
     ] = None,
     variant: options.MitsubaVariant = "auto",
 ) -> None:
-    """Render a material in the preview scene, or a Mitsuba scene as it is, to EXR and PNG.
+    """Render a material in the preview scene, or a Mitsuba scene unchanged, and write an EXR and a PNG file.
 
-    Scenes may use the BSDFs `nma` and `layered`, which the program `mitsuba` does not know. A scene brings its own
-    materials, camera, lights and path depth, so the options for those are for materials alone.
+    A Mitsuba scene may contain the BSDFs `nma` and `layered`, which the program `mitsuba` cannot load. A Mitsuba scene
+    defines its own materials, camera, lights and path depth, so the options that set these are rejected for a scene.
 
     Examples: [bold]nma render gold-red-lacquer --camera close --set alpha_top=.05[/bold],
     [bold]nma render my-material.toml --model layered -o out/my.exr[/bold], [bold]nma render scene.xml --spp 256[/bold]
@@ -103,7 +103,7 @@ def render(
 def _load_file(
     path: str, define: list[str] | None, size: tuple[int, int] | None, variant: str
 ) -> tuple[Any, int]:
-    """A scene from an XML file, and the samples per pixel that it asks for."""
+    """Loads a scene from an XML file. Returns the scene, and the samples per pixel that the file sets."""
     import nma.render
     from nma.render.load import load_scene
 
@@ -119,7 +119,7 @@ def _clamped(scene: Any, limit: float) -> Any:
 
 
 def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float) -> None:
-    """Writes all channels as EXR and the colours as PNG."""
+    """Writes an EXR file with all channels and a PNG file with only the colour channels."""
     from nma.images.io import write_exr, write_png
     from nma.render.channels import channel_names, colours
 
@@ -130,5 +130,5 @@ def _write(image: Any, scene: Any, pictures: tuple[Path, Path], exposure: float)
 
 
 def _outputs(path: Path) -> tuple[Path, Path]:
-    """The EXR and the PNG to write: both names differ from `path` by their endings alone."""
+    """The paths of the EXR file and of the PNG file, which differ from `path` only in their endings."""
     return path.with_suffix(".exr"), path.with_suffix(".png")

@@ -1,4 +1,4 @@
-"""`nma simulate`: reference tables of materials."""
+"""The command `nma simulate`: simulates reference tables of materials."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def simulate(
     walks: Annotated[int, options.walks("Random walks per material.")] = 16_000_000,
     seed: Annotated[int, options.seed("Seed of the walks and of the drawn materials.")] = 0,
 ) -> None:
-    """Simulate materials and write their tables with standard errors: a reference file.
+    """Simulate materials, and write their tables and standard errors to a reference file.
 
     Example: [bold]nma simulate --material gold-red-lacquer --walks 128000000 -o gold.npz[/bold]
     """
@@ -53,7 +53,7 @@ def simulate(
     from nma.table import Tables, kept, stream_keys, tabulate
 
     files.try_file(output)
-    # Finished materials are kept beside the output, so that a killed run goes on where it stopped.
+    # Every finished material is stored in a folder beside the output, so that the same command continues a killed run.
     parts = output.with_name(output.name + ".parts")
     files.try_folder(parts)
     source = sources.get(_class_of(material) if material else class_name)
@@ -77,19 +77,19 @@ def simulate(
 
 
 def _class_of(names: list[str]) -> str:
-    """The class of all these materials."""
+    """The class of the named materials; raises `BadParameter` if they belong to several classes."""
     from nma import materials
 
     classes = sorted({materials.load(name).class_name for name in names})
     if len(classes) > 1:
         raise typer.BadParameter(
-            f"materials of the classes {', '.join(classes)}; simulate one class at a time"
+            f"the materials belong to the classes {', '.join(classes)}; simulate one class at a time"
         )
     return classes[0]
 
 
 def _vectors(space, params, material, draw, population, seed):
-    """The parameter vectors to simulate. The user names them in exactly one of three ways."""
+    """The parameter vectors to simulate, which the user selects by exactly one of --params, --material and --draw."""
     import numpy as np
 
     if (params is not None) + bool(material) + bool(draw) != 1:
@@ -98,9 +98,9 @@ def _vectors(space, params, material, draw, population, seed):
         try:
             with files.arrays(params) as f:
                 vectors = np.asarray(f["params"], np.float64)
-        except Exception as e:  # zipfile has an exception of its own for damaged archives
+        except Exception as e:  # also zipfile.BadZipFile, for a damaged archive
             raise TableError(
-                f"{params}: this is no .npz file with an array `params` (n, {space.size}): {e}"
+                f"{params} is not an .npz file with an array `params` of shape (n, {space.size}): {e}"
             ) from None
         return space.check(vectors)
     if material:

@@ -1,4 +1,4 @@
-"""`nma train`: an adapter for a whole class."""
+"""The command `nma train`: trains an adapter for a whole class of materials."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def train(
     learning_rate: options.Rate = None,
     seed: options.TrainingSeed = 0,
 ) -> None:
-    """Train an adapter for a whole class. If killed, run it again: it goes on from its checkpoint (OUTPUT.ckpt).
+    """Train an adapter for a whole class of materials.
+
+    If a run is killed, the same command continues from the checkpoint OUTPUT.ckpt.
 
     Example: [bold]nma dataset layered3 l3.zarr && nma train layered3 --data l3.zarr -o my.safetensors[/bold]
     """
@@ -86,7 +88,7 @@ def train(
 
 
 def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
-    """What to train on, and the record of its origin: tables of a dataset, or settings for a stream of materials."""
+    """The tables of a dataset, or the settings of a stream of materials; and a record of where the tables come from."""
     from nma.table.dataset import Dataset, Settings
 
     if (data is None) == (stream == 0):
@@ -96,7 +98,9 @@ def _training_data(class_name: str, data: Path | None, stream: int, walks: int, 
         return settings, {"data": "stream", "dataset": asdict(settings)}
     dataset = Dataset.open(data)
     if dataset.settings.class_name != class_name:
-        raise typer.BadParameter(f"{data} holds class {dataset.settings.class_name}, not {class_name}")
+        raise typer.BadParameter(
+            f"{data} is a dataset of the class {dataset.settings.class_name}, not of {class_name}"
+        )
     with console.err.status(f"reading {dataset.settings.materials} tables"):
         tables = dataset.load()
     return tables, {"data": "dataset", "dataset": asdict(dataset.settings)}

@@ -1,4 +1,4 @@
-"""What the commands that train share: the settings that a variant makes, and the end of a run."""
+"""Functions that the training commands share: they read the option --variant and write the results of a run."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import Any
 
 from nma.cli import console, options
 
-# The printed loss is the mean over this many steps, the last ones.
+# The printed loss is the mean over this many of the last steps.
 _LAST = 500
 
 
 def of_variant(variant: str, target: str | None, instances: int | None = None) -> dict[str, Any]:
-    """The settings of a recipe that a variant of the paper decides, unless `target` or `instances` say otherwise."""
+    """The fields of a recipe that a variant of the paper sets; `target` and `instances` take precedence if given."""
     count, directional = options.VARIANTS[variant]
     if not directional:
-        # Without the view direction there is no plane to stretch along.
+        # If the parameters do not depend on the view direction, lobes cannot be stretched along the plane of incidence.
         target = target or "principled"
     return {"instances": instances or count, "directional": directional, "target": target}
 
 
 def finish(adapter: Any, run: Any, output: Path) -> None:
-    """Writes the weights and the plot of the losses, and says so."""
+    """Writes the weights file and the plot of the loss, and prints their paths and the loss."""
     adapter.save(output)
     loss, plot = losses(run, output)
     console.say(
@@ -31,7 +31,7 @@ def finish(adapter: Any, run: Any, output: Path) -> None:
 
 
 def losses(run: Any, output: Path) -> tuple[float, Path]:
-    """The log loss of the last steps, and the plot of all, which is drawn beside the weights."""
+    """The mean log loss of the last steps, and the path of the plot of all steps, which is drawn beside the weights."""
     from nma.train.plot import plot_losses
 
     last = run.log_losses[-_LAST:]
