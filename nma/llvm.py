@@ -1,6 +1,6 @@
 """Finds a libLLVM with which Dr.Jit can compile CPU kernels.
 
-An old libLLVM raises no error: it kills the process while Dr.Jit compiles a kernel ("LLVM ERROR: Cannot select"). So
+An old libLLVM raises no error, but kills the process while Dr.Jit compiles a kernel ("LLVM ERROR: Cannot select"). So
 this module looks for the newest libLLVM of the system, and raises an error before Dr.Jit loads an old one.
 
 This file needs only the standard library, so `python3 -I nma/llvm.py` can be run before anything is installed.
@@ -16,7 +16,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-# On CPUs with AVX-512, Dr.Jit 1.5 aborts in libLLVM 15 and 16 (at `fmaximum`). With libLLVM 17, 18, 19 and 22 it
+# On CPUs with AVX-512, Dr.Jit 1.5 aborts in libLLVM 15 and 16 (at `fmaximum`). With libLLVM 17, 18, 19 and 22, Dr.Jit
 # rendered identical pictures.
 MIN_VERSION = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -130,7 +130,8 @@ def _examine(path: str) -> tuple[int | None, str]:
 
 @cache
 def _newest() -> tuple[str, int, str]:
-    """The path and the version of the newest libLLVM that can be loaded, and the message of `_examine`."""
+    """The path and the version of the newest libLLVM that can be loaded, and a message that says why there is no usable
+    libLLVM ("" if there is one)."""
     for path in candidates():
         found, fault = _examine(path)
         if found is not None:
@@ -161,7 +162,7 @@ def ensure_llvm() -> None:
 
     The first import of Dr.Jit loads libLLVM. If Dr.Jit is not yet imported, this function sets DRJIT_LIBLLVM_PATH,
     unless the user has set it. If Dr.Jit is already imported, this function asks Dr.Jit which libLLVM is loaded. Raises
-    `MissingDependencyError` if there is no usable libLLVM, or if Dr.Jit has loaded one that is too old.
+    `MissingDependencyError` if there is no usable libLLVM, or if Dr.Jit has loaded a libLLVM that is too old.
     """
     if "drjit" in sys.modules:
         _check_loaded()

@@ -6,12 +6,12 @@
 //
 // - Walks alone: the direction in which a walk leaves is drawn by the material, so the walk seldom meets a small lamp.
 // - Evaluation alone: the directions to the lamp are drawn uniformly, so most of them miss the peak of a narrow lobe.
-// - Walks and evaluation: a path tracer combines both, and weights each sample by multiple importance sampling (Veach
-//   1997, eq. 9.8). The weights need the densities of both estimates, but the density of a walk has no closed form. The
-//   mean stays the same with any other density, if both estimates use it. `pdf` is close to the density of a walk, so
-//   it makes the noise small.
-// - `sample`: blends and masks of materials compute weights from the densities of samples, so the samples must have
-//   exactly that density. Directions that `sample` draws have exactly the density `pdf`.
+// - Walks and evaluation: a path tracer combines the two estimates above by multiple importance sampling (Veach 1997,
+//   eq. 9.8). The weights of multiple importance sampling need the density of a walk, which has no closed form. The
+//   mean stays the same with another density, if the weights of both estimates use the same density. `pdf` is close to
+//   the density of a walk, so the noise is small.
+// - Samples of `sample`: blends and masks of materials compute weights from the densities of samples, so they need
+//   samples whose exact density is known. Directions that `sample` draws have exactly the density `pdf`.
 #include <cstdio>
 
 #include "nma/layered.h"

@@ -41,8 +41,8 @@ namespace nma {
 // The options for loading a weights file.
 struct Options {
     // If the CPU lacks the instruction set, `portable` is used instead. All instruction sets compute in float32, except
-    // avx512_bf16. The latter rounds weights and activations to bfloat16, which keeps 8 significant bits, and so halves
-    // the time of a network on some CPUs.
+    // avx512_bf16. avx512_bf16 rounds weights and activations to bfloat16, which keeps 8 significant bits, and so
+    // halves the time of a network on some CPUs.
     InstructionSet set = fastest();
     // Rounds weights to bfloat16, which halves the memory that a query has to read. The rounding raised the log loss of
     // both shipped adapters by less than .00002. The instruction set avx512_bf16 always rounds weights.
@@ -67,7 +67,7 @@ public:
         return Adapter(parse_weights(bytes, size), options);
     }
 
-    // The count of numbers that `prepare` reads as the parameters of a material. They are in the order of
+    // The count of numbers that `prepare` reads as the parameters of a material. The numbers are in the order of
     // `parameters()`. A colour has three numbers.
     int parameter_count() const { return preparation_.encoding.parameters(); }
     const std::vector<SourceParam>& parameters() const { return weights_.parameters; }
@@ -96,8 +96,8 @@ public:
     int output_count() const { return preparation_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
-    // Whether the BRDF depends on the azimuth of `wi`. If it does not, `prepare` reads only wi.z. Functions that take a
-    // cosine c instead of `wi` use the azimuth 0, which is wi = (sqrt(1 - c^2), 0, c).
+    // Whether the BRDF depends on the azimuth of `wi`. If the azimuth does not matter, `prepare` reads only wi.z.
+    // Functions that take a cosine c instead of `wi` use the azimuth 0, which is wi = (sqrt(1 - c^2), 0, c).
     bool anisotropic() const { return preparation_.encoding.anisotropic(); }
 
     // The BRDF of a source material with these parameters for the view direction `wi`, which has z in (0, 1].
@@ -176,17 +176,17 @@ private:
         preparation_.instances = weights_.instances;
         preparation_.outputs = static_cast<int>(places_.size()) * weights_.instances + weights_.instances - 1;
         preparation_.bounded = weights_.bounded;
-        // `check_description` compares these counts with the sizes of the layers, so it needs the layers as they are in
-        // the file.
+        // `check_description` compares the counts of inputs and outputs with the sizes of the layers, so it must
+        // precede the changes to the layers below.
         check_description();
         // Reorders the inputs of the first layer to the order in which `encode` writes them.
         weights_.layers.front() = preparation_.encoding.arranged(weights_.layers.front());
         network_ = Network(weights_.layers, options.set, options.compact);
         preparation_.network = network_.view();
-        // These two functions need the padded count of outputs, which `Network` has computed.
+        // `lay_out_ranges` and `lay_out_lanes` need the padded count of outputs, which `Network` has computed.
         lay_out_ranges();
         lay_out_lanes();
-        // The network has copied the weights.
+        // The layers are no longer needed, because `Network` has copied the weights.
         weights_.layers.clear();
     }
 
@@ -211,8 +211,8 @@ private:
     void check_description() const {
         if (anisotropic() && (in_plane_ || !weights_.directional))
             throw Error(
-                "it is anisotropic, but its lobes stretch along the plane of incidence, or its network does not read "
-                "the view direction; train again");
+                "the adapter is anisotropic, but its lobes stretch along the plane of incidence, or its network does "
+                "not read the view direction; train again");
         if (weights_.dialect != DIALECT)
             throw Error("the network was trained for the Principled dialect '" + weights_.dialect +
                         "', but this version evaluates '" + DIALECT + "'");

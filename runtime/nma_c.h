@@ -31,7 +31,7 @@ typedef struct nma_curves nma_curves;
 #define NMA_ALIGNED __attribute__((aligned(16)))
 #endif
 
-/* A BRDF at one shading point. Its address must be a multiple of 16 bytes. */
+/* A BRDF at one shading point. The address of an `nma_brdf` must be a multiple of 16 bytes. */
 typedef struct {
     NMA_ALIGNED float opaque[168];
 } nma_brdf;
@@ -55,7 +55,8 @@ NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
  * to. The index must be at least 0 and less than nma_parameter_count. */
 NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int index);
 NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int index, float range[2]);
-/* Whether the adapter was fitted to a single material. If so, writes the parameters of that material. */
+/* Whether the adapter was fitted to a single material. If it was, this function writes the parameters of that material.
+ * */
 NMA_C_API int nma_single_material(const nma_adapter* adapter, float* parameters);
 /* The index of the first number that is not allowed, or -1 if all numbers are allowed. A number is allowed if it is
  * finite and lies in its training range. Outside that range, the BRDF does not match the source material. If the
@@ -65,8 +66,8 @@ NMA_C_API int nma_check(const nma_adapter* adapter, const float* parameters);
 NMA_C_API void nma_clamp(const nma_adapter* adapter, float* parameters);
 NMA_C_API int nma_output_count(const nma_adapter* adapter);
 NMA_C_API int nma_instruction_set(const nma_adapter* adapter);
-/* Whether the BRDF depends on the azimuth of the view direction. If it does, pass directions, because functions that
- * take a cosine use the azimuth 0. */
+/* Whether the BRDF depends on the azimuth of the view direction. If the azimuth matters, pass directions, because
+ * functions that take a cosine use the azimuth 0. */
 NMA_C_API int nma_anisotropic(const nma_adapter* adapter);
 
 NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, float cos_theta_i, nma_brdf* brdf);
@@ -92,8 +93,8 @@ NMA_C_API void nma_curves_at(const nma_curves* curves, float cos_theta_i, nma_br
 NMA_C_API void nma_curves_free(nma_curves* curves);
 
 /* For each BRDF, `nma_eval_pdf` writes four floats: f cos(theta_o) [1/sr] as RGB, and the density [1/sr]. `nma_sample`
- * draws a direction from three uniform numbers in [0, 1), which it reads from `u`. It writes seven floats: the
- * direction, its value and its density. A density of 0 marks an invalid direction. */
+ * draws a direction from three uniform numbers in [0, 1), which it reads from `u`. `nma_sample` writes seven floats:
+ * the direction, its value and its density. A density of 0 marks an invalid direction. */
 NMA_C_API void nma_eval_pdf(int count, const nma_brdf* brdfs, const float* wi, const float* wo, float* value_pdf);
 NMA_C_API void nma_sample(int count, const nma_brdf* brdfs, const float* wi, const float* u, float* wo_value_pdf);
 

@@ -98,7 +98,7 @@ def nested(depth):
         (stored("layered3-3x32")[:-4], "does not lie within the file"),
         (b"\xff" * 100, "truncated"),
         (struct.pack("<Q", 2) + b"{}", "__metadata__"),
-        (struct.pack("<Q", 3) + b'{"a', "open string"),
+        (struct.pack("<Q", 3) + b'{"a', "a string without an end"),
         (struct.pack("<Q", 60) + b"[" * 60, "nested too deep"),
         (changed("layered3-3x32", format=2), "format"),
         (changed("layered3-3x32", encoding="new"), "unknown input encoding 'new'"),
@@ -200,7 +200,7 @@ def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
             runtime.prepare(other, mu, clamp=clamp)
     for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13):
         replace(adapter, training={"params": params}).save(path)
-        with pytest.raises(WeightsError, match="its material does not fit the class layered3"):
+        with pytest.raises(WeightsError, match="the recorded material does not fit the class layered3"):
             Runtime(path)
     adapter.save(path)
     assert Runtime(path).material is None

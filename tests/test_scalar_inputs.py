@@ -236,7 +236,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
         ({"precision": "half"}, "precision is float32, compact or bfloat16, not 'half'"),
         ({"adapter": "none"}, "none: no such weights file"),
         ({"albedo": None}, "no value for albedo"),
-        ({"material": "wet-nickel"}, "`material` is known in vectorised variants only"),
+        ({"material": "wet-nickel"}, "only vectorised variants have the property `material`"),
         (
             {"sigma_t": bitmap(7.0)},
             "the texture of sigma_t at x=1, y=2: sigma_t is 7, allowed is 0 .. 1, the range",

@@ -32,7 +32,7 @@ def classes() -> str:
 
 
 def _simulated() -> list[tuple[str, ParamSpace]]:
-    """The names and the parameters of the classes whose appearance a source of this package simulates."""
+    """The names and the parameters of the classes of materials that have a source in nma/sources."""
     return [(name, sources.space(name)) for name in sources.names()]
 
 

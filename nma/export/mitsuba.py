@@ -16,8 +16,8 @@ _FIELDS = (
 # The number of significant digits that are written. Mitsuba reads numbers in single precision, which holds about 7
 # digits.
 _DIGITS = 7
-# A `specular` below _MIN_SPECULAR counts as 0, which is a dielectric without reflection. Its `eta` is set to _MIN_ETA
-# instead of 1, because Mitsuba 3.9 leaves out the reflection of metals, too, if `eta` is 1.
+# A `specular` below _MIN_SPECULAR counts as 0, which is a dielectric without reflection. The `eta` of such a dielectric
+# is set to _MIN_ETA instead of 1, because with `eta` 1, Mitsuba 3.9 leaves out the reflection of metals, too.
 _MIN_SPECULAR, _MIN_ETA = 1e-6, 1.00001
 
 
@@ -30,7 +30,7 @@ def principled_dict(p: Principled) -> dict[str, Any]:
 
     `specular` is replaced by the `eta` with the same reflectance in two cases: if `specular` is above 1, which is
     Mitsuba's limit, and if it is 0, for which Mitsuba leaves out the reflection of metals. Raises `ParamError` for
-    parameters that the plugin does not have, and for values that it does not allow.
+    parameters that Mitsuba's plugin does not have, and for values that Mitsuba does not allow.
     """
     values = {name: float(getattr(p, name)) for name in _FIELDS}
     base_color = [float(c) for c in p.base_color]

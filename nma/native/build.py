@@ -3,9 +3,9 @@
 
 The compiled files are kept in the user's cache, in a subfolder whose name contains a digest of the C++ sources and of
 the versions of the packages that the plugins link to. So the C++ sources are compiled again after an update of this
-package or of Mitsuba, and plugins of another version are never loaded. The compiler is the first that exists of the one
-named in `CXX`, c++, g++ and clang++. This module is tested on Linux, should work on macOS, and raises an error on
-Windows.
+package or of Mitsuba, and plugins of another version are never loaded. The compiler is the one that the environment
+variable `CXX` names, or else c++, g++ or clang++. This module is tested on Linux, should work on macOS, and raises an
+error on Windows.
 """
 
 from __future__ import annotations

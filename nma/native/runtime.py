@@ -1,4 +1,4 @@
-"""Calls the C++ runtime from Python for many queries at once. Its shared library is compiled on the first call.
+"""Calls the C++ runtime from Python for many queries at once. The first call compiles the runtime as a shared library.
 
     runtime = nma.native.runtime.Runtime("layered3-5x64")
     brdfs = runtime.prepare(params, wi)                        # (n, 13) in the training range, (n, 3)
@@ -54,7 +54,8 @@ class Runtime:
         parameters: the number of columns of `params`.
         names: for each column, the name of its parameter.
         low, high: the training range of each column.
-        material: the parameters of the material, if the adapter was fitted to a single material; None otherwise.
+        material: the parameters of the single material that the adapter was fitted to, or None if it was trained on a
+            class.
         size: the number of the network's outputs.
         instruction_set: the instruction set in use.
         anisotropic: whether the adapter depends on the azimuth of `wi`.
@@ -154,8 +155,8 @@ class Runtime:
         return numbers if self._c.nma_single_material(self._handle, _pointer(numbers)) else None
 
     def _checked(self, params: ArrayLike, clamp: bool) -> Array:
-        """`params` as float32 rows. Raises `ParamError` if a parameter is outside the training range, or differs from
-        that of the single material that the adapter was fitted to."""
+        """`params` as float32 rows. Raises `ParamError` if a parameter is outside the training range. If the adapter
+        was fitted to a single material, raises `ParamError` if a parameter differs from that material."""
         rows = _rows("params", params, self.parameters)
         if self.material is not None:
             other = ~np.isclose(rows, self.material, rtol=SAME)

@@ -41,7 +41,7 @@ struct Input {
     // Whether the input is a texture that is the same at all points. The texture object may have other owners.
     bool shared() const { return texture && !varies(); }
 
-    // The numbers of the texture at `si`. They are not checked.
+    // The numbers of the texture at `si`, which are not checked.
     Colour looked_up(const SurfaceInteraction3f& si) const {
         const Colour colour = Colour(texture->eval(si));
         return param.size == 1 ? Colour(colour[std::max(channel, 0)]) : colour;
@@ -63,8 +63,8 @@ public:
         : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
         if (props.has_property("material"))
             Throw(
-                "`material` is known in vectorised variants only; give the parameters (`nma materials NAME` shows "
-                "them, nma.render.load.material_bsdf makes them)");
+                "only vectorised variants have the property `material`; give the parameters (`nma materials NAME` "
+                "shows them, nma.render.load.material_bsdf makes them)");
         for (const SourceParam& p : parameters) {
             if (!props.has_property(p.name)) Throw("no value for %s; give it a number, a colour or a texture", p.name);
             inputs_.push_back(read(props, p));

@@ -6,9 +6,10 @@
 // random numbers from the bits of its arguments.
 //
 // `sample` simulates one walk if this BSDF is the BSDF of the shape. Other BSDFs, such as `blendbsdf` and `mask`, may
-// contain this BSDF. Those BSDFs compute weights from the densities of samples, so the sampled directions must have the
-// exact density `pdf`. The directions of walks have another density, so inside of other BSDFs `sample` draws directions
-// with the density `pdf` instead. The weight of such a sample is an estimate of the value, divided by `pdf`.
+// contain this BSDF. `blendbsdf` and `mask` compute weights from the densities of samples, so the sampled directions
+// must have exactly the density `pdf`. The directions of walks have another density, so inside of other BSDFs `sample`
+// draws directions with the density `pdf` instead of simulating a walk. The weight of a direction drawn with the
+// density `pdf` is an estimate of the value, divided by `pdf`.
 #include <mitsuba/core/random.h>
 #include <mitsuba/render/shape.h>
 

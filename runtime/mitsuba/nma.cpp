@@ -170,9 +170,10 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value that this plugin returns to Mitsuba. On a path from the camera, the value is `value`. On a path from
-    // the light, `wo` points towards the camera, so a blend is prepared for `wo`. This makes the reflection the same
-    // for both kinds of paths. A blend is not reciprocal, so the blend prepared for `si.wi` would return another value.
+    // The value that this plugin returns to Mitsuba. On a path from the camera, the function returns the argument
+    // `value`. On a path from the light, `wo` points towards the camera, so the function prepares a blend for `wo`. A
+    // blend is not reciprocal, so on a path from the light the blend prepared for `si.wi` would return another value
+    // than on a path from the camera.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

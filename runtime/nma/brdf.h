@@ -10,8 +10,8 @@ using Direction = Vec3<float>;
 using Value = Evaluation<float>;
 using Sampled = Sample<float>;
 
-// The BRDF at one shading point. It is valid only for view directions with the cos(theta_i) that it was prepared for.
-// If the adapter is anisotropic, the BRDF is valid only for the `wi` that it was prepared for.
+// The BRDF at one shading point. The BRDF is valid only for view directions with the cos(theta_i) that it was prepared
+// for. If the adapter is anisotropic, the BRDF is valid only for the `wi` that it was prepared for.
 class Brdf {
 public:
     // The value f cos(theta_o) [1/sr], which is 0 below the horizon.
@@ -56,9 +56,9 @@ private:
     friend class Adapter;
     friend class Curves;
 
-    // The frame in which the blend is evaluated. If the lobes were trained in the plane of incidence, they are
-    // anisotropic along that plane. Each call computes the plane from `wi`, because a BRDF that was prepared for a
-    // cosine is used for all azimuths.
+    // The frame in which the blend is evaluated. If the lobes were trained in the plane of incidence, the axes of their
+    // anisotropy are in that plane and perpendicular to it. Each call computes the plane from `wi`, because a BRDF that
+    // was prepared for a cosine is used for all azimuths.
     Plane<float> frame(const Direction& wi) const { return in_plane_ ? plane_of<float>(wi) : Plane<float>{1.0f, 0.0f}; }
 
     Blend<float> blend_;

@@ -42,7 +42,7 @@ public:
                 return 13 + 3 * directional_;
         }
     }
-    // Whether the inputs depend on the azimuth of `wi`. If they do not, `encode` reads only wi.z.
+    // Whether the inputs depend on the azimuth of `wi`. If the azimuth does not matter, `encode` reads only wi.z.
     bool anisotropic() const { return kind_ == Kind::Azimuth; }
 
     // Reorders the inputs of `first`, the first layer of a file, to the order in which `encode` writes them. The orders
@@ -99,8 +99,8 @@ private:
     static int place(int i) { return i < 4 ? i : i < 13 ? 4 + (i - 4) / 3 * 4 + (i - 4) % 3 : 4 * (i - 13) + 7; }
 
     // Writes sin(theta_i) times the cosine and the sine of the azimuth phi, and sin^2(theta_i) times the cosine and the
-    // sine of 2 phi. These factors go to 0 towards normal incidence, which has no azimuth. Returns a pointer to the end
-    // of the written numbers.
+    // sine of 2 phi. The factors sin(theta_i) and sin^2(theta_i) go to 0 towards normal incidence, which has no
+    // azimuth. Returns a pointer to the end of the written numbers.
     static float* azimuth(const Vec3<float>& wi, float* x) {
         const float numbers[] = {wi.x, wi.y, wi.x * wi.x - wi.y * wi.y, 2.0f * wi.x * wi.y};
         return std::copy_n(numbers, 4, x);
@@ -116,8 +116,8 @@ private:
         const Four n = four(p + layered3::ETA_CONDUCTOR) * inside, k = four(p + layered3::K_CONDUCTOR) * inside;
         const Four k2 = k * k, less = n - one, more = n + one;
         Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
-        // `normal` is `fresnel_conductor` at normal incidence: |eta - 1|^2 / |eta + 1|^2 for the complex index eta = n
-        // + i k.
+        // `normal` is the reflectance at normal incidence, |eta - 1|^2 / |eta + 1|^2, where eta = n + i k is the
+        // complex index.
         Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + layered3::ALBEDO);
         const Four plain{p[layered3::ALPHA_TOP], p[layered3::ALPHA_BOTTOM], eta_top, sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;

@@ -1,5 +1,5 @@
-// A strict reader for JSON (RFC 8259), with the features that weights files need. It returns a tree of values of
-// limited depth.
+// A strict reader for JSON (RFC 8259), with the features that weights files need. The reader returns a tree of values
+// of limited depth.
 //
 // An object stores its names and its items in two vectors. One vector of pairs is not possible, because std::pair,
 // unlike std::vector, must not contain the type `Json` before that type is complete.
@@ -165,7 +165,7 @@ private:
         expect("\"");
         std::string made;
         while (peek() != '"') {
-            if (place_ >= text_.size()) fail("an open string");
+            if (place_ >= text_.size()) fail("a string without an end");
             const char c = text_[place_++];
             if (c == '\\') escape(made);
             else made.push_back(c);

@@ -2,9 +2,9 @@
 // binary runs on all CPUs.
 //
 // The code in kernels/body.inl is compiled for the vector type of each instruction set. Only avx512_bf16 has its own
-// code for the network (kernels/avx512_bf16.h), which rounds weights and activations to bfloat16. Some compilers crash
-// on that file, such as clang 16 at -O1. The macro NMA_NO_AVX512_BF16 leaves out that file. The macro NMA_PORTABLE_ONLY
-// leaves out the code of all instruction sets except `portable`.
+// code for the network (kernels/avx512_bf16.h), which rounds weights and activations to bfloat16. The macro
+// NMA_NO_AVX512_BF16 leaves out avx512_bf16.h, on which some compilers crash, such as clang 16 at -O1. The macro
+// NMA_PORTABLE_ONLY leaves out the code of all instruction sets except `portable`.
 #pragma once
 
 #include <cstdint>
@@ -106,8 +106,7 @@ struct Kernels {
     // `encode` fills in a row of inputs. `decode` makes a blend of `raw`, a row of outputs, and overwrites `raw`.
     // `set_lobe_probabilities` then completes the blend. `decode` uses wide vectors, and `set_lobe_probabilities` uses
     // narrow vectors. Some CPUs run narrow vector instructions at half the speed while wide vector instructions are
-    // running. So `prepare_many` calls `decode` for all queries of a block first, and then `set_lobe_probabilities` for
-    // all of them.
+    // running. So `prepare_many` calls `decode` for all queries of a block before it calls `set_lobe_probabilities`.
     void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
     void (*decode)(const Preparation&, float* raw, float cosine, Blend<float>&);
     void (*set_lobe_probabilities)(const Preparation&, float cosine, Blend<float>&);

@@ -118,8 +118,8 @@ inline Floats logarithms(Floats a) {
     return exponent * 0.693147181f + (2.0f * s + s * series);
 }
 
-// e^a, to two units in the last place for |a| <= 87. It is computed as 2^n e^r with a whole number n and r = a - n
-// log(2), where |r| is at most log(2) / 2 and e^r is a power series.
+// e^a, to two units in the last place for |a| <= 87. The result is 2^n e^r with a whole number n and r = a - n log(2),
+// where |r| is at most log(2) / 2 and e^r is computed as a power series.
 inline Floats exponentials(Floats a) {
     const Floats octaves = a * 1.44269504f;
     const Floats half = octaves < 0.0f ? Floats{-0.5f, -0.5f, -0.5f, -0.5f} : Floats{0.5f, 0.5f, 0.5f, 0.5f};

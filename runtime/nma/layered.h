@@ -68,7 +68,8 @@ namespace detail {
 inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)); }
 // `w` moved slightly above the horizon, where visible normals are undefined.
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
-// The inverse of a density. It is large for a wide lobe. `unscattered` computes the weights of connections from it.
+// The inverse of a density, which is large for a wide lobe. `unscattered` computes the weights of connections from this
+// inverse.
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
 // The reflectance of the conductor, per colour channel.
@@ -214,7 +215,7 @@ inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
 // A path is sampled from both ends: the walk `there` starts at wi, and the walk `back` starts at wo. A connection joins
 // a segment of `there` to the first segment of `back`, or to wo. The walks draw all events of the path at random except
 // the connection, for which the function evaluates its scattering density instead. Several choices of the connection
-// could make the same path. `share` is the multiple importance sampling weight of one choice. It is large if the
+// could make the same path. `share` is the multiple importance sampling weight of one choice. `share` is large if the
 // density at the connection is small, as in a wide lobe.
 inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
                        Random& random, bool forward, Way& detour) {
@@ -324,9 +325,9 @@ inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     return made;
 }
 
-// The numbers of `pdf` that depend on wi only. `coat`, `bottom` and `diffuse` are the weights of three lobes, and sum
-// to 1. The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe.
-// `width` is the roughness of the second lobe, and `inside` is wi refracted into the coat.
+// The intermediate results of `pdf` that depend on wi only. `coat`, `bottom` and `diffuse` are the weights of three
+// lobes, and sum to 1. The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a
+// cosine lobe. `width` is the roughness of the second lobe, and `inside` is wi refracted into the coat.
 struct Density {
     float coat, bottom, diffuse, width;
     Vec inside;
@@ -384,8 +385,8 @@ inline Drawn sample(const Stack& stack, const Density& density, const Vec& wi, f
     return {wo, pdf(stack, density, wi, wo)};
 }
 
-// The directional albedo at `wi` (wi.z > 0), at most 1. It is the mean throughput of a fixed set of walks, so it has no
-// noise.
+// The directional albedo at `wi` (wi.z > 0), at most 1. The albedo is the mean throughput of a fixed set of walks, so
+// it has no noise.
 inline Vec albedo(const Stack& stack, const Vec& wi, int walks = 256) {
     Vec sum{0.0f, 0.0f, 0.0f};
     for (int k = 0; k < walks; ++k) {

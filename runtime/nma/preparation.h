@@ -8,7 +8,8 @@
 
 namespace nma {
 
-// The data of an adapter. An `Adapter` owns the arrays that the pointers in this structure point to.
+// The data of an adapter that `prepare` reads. An `Adapter` owns the arrays that the pointers in this structure point
+// to.
 struct Preparation {
     Encoding encoding;
     NetworkView network;

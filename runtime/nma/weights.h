@@ -241,15 +241,16 @@ inline std::vector<float> material(const Json& about, const Weights& made) {
         if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30)
             found.push_back(static_cast<float>(item.number));
     if (found.size() != size || fitted->items.size() != size)
-        throw Error("its material does not fit the class " + made.class_name + "; fit the adapter again");
+        throw Error("the recorded material does not fit the class " + made.class_name + "; fit the adapter again");
     return found;
 }
 
 inline Weights weights(const char* bytes, std::size_t size) {
     std::uint64_t length = 0;
-    if (size < 8) throw Error("too short for a weights file");
+    if (size < 8) throw Error("the file is too short for a weights file");
     for (int k = 7; k >= 0; --k) length = length << 8 | static_cast<unsigned char>(bytes[k]);
-    if (length > size - 8) throw Error("truncated, or not a safetensors file; copy the file again or train again");
+    if (length > size - 8)
+        throw Error("the file is truncated, or not a safetensors file; copy the file again or train again");
     const Json header = Json::parse({bytes + 8, static_cast<std::size_t>(length)});
     const Json& metadata = header.at("__metadata__", Json::Kind::Object);
     const Json about = Json::parse(metadata.at("nma", Json::Kind::String).string);
@@ -279,12 +280,12 @@ inline Weights weights(const char* bytes, std::size_t size) {
 
 }  // namespace detail
 
-// Parses the bytes of a weights file. Throws `Error` if they are not a valid weights file.
+// Parses the bytes of a weights file. Throws `Error` if the bytes are not a valid weights file.
 inline Weights parse_weights(const void* bytes, std::size_t size) {
     return detail::weights(static_cast<const char*>(bytes), size);
 }
 
-// Returns the bytes of a file. Throws `Error` if it cannot be read.
+// Returns the bytes of a file. Throws `Error` if the file cannot be read.
 inline std::string read_file(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     std::string bytes;

@@ -111,8 +111,8 @@ NMA_FN inline void forward_many(const NetworkView& view, int queries, const floa
     for (; q < queries; ++q) forward(view, inputs + q * input_stride, outputs + q * output_stride);
 }
 
-// 2^x for |x| <= 126, to two units in the last place. It is computed as 2^n times a power series in x - n, where n is
-// the whole number nearest to x, so |x - n| is at most 1/2.
+// 2^x for |x| <= 126, to two units in the last place. The result is 2^n times a power series in x - n, where n is the
+// whole number nearest to x, so |x - n| is at most 1/2.
 NMA_OP Vec exp2(Vec x) {
     const Vec n = nearest(x), r = sub(x, n), r2 = mul(r, r);
     const Vec low = fma(fma(r, set(0.0555041087f), set(0.240226507f)), r2, fma(r, set(0.693147181f), set(1.0f)));

@@ -20,8 +20,8 @@ constexpr int WIDTH_STEP = 16, INPUT_STEP = 4;
 // registers.
 constexpr int NARROW = 32;
 
-// A layer maps `in` inputs to `width` neurons. `in` and `width` include the padding, and the weights of the padding are
-// 0. A layer has either `columns` or `pairs`:
+// A layer maps `in` inputs to `width` neurons. `in` and `width` include the padding, whose weights are 0. A layer has
+// either `columns` or `pairs`:
 //
 //     columns  [in][width]      floats. Column i holds the weights from input i to all neurons.
 //     pairs    [in / 2][width]  two weights as bfloat16 in 32 bits: the weight from input 2 i in the low half, and the
@@ -43,10 +43,10 @@ constexpr int NARROW = 32;
 //     column 3, times x3     3>0  3>1  3>2  3>3         r = 3, times x0..x3    0>3  1>0  2>1  3>2    3
 //
 // Lane k of sum r belongs to neuron (k + r) % 4. Therefore sum r is rotated once, by r lanes to the right, after the
-// products of all inputs were added to it. The neurons are the total of the four rotated sums. A layer has many such
-// squares of 4 x 4 weights. Square (b, g) has the weights from the inputs 4 b .. 4 b + 3 to the neurons 4 g .. 4 g + 3.
-// Row r of square (b, g) is in column 4 b + r of `turned`, at the elements 4 g .. 4 g + 3. In memory, the columns of
-// the first WIDTH_STEP neurons are followed by the columns of the next WIDTH_STEP neurons.
+// products of all inputs were added to it. The neurons are the total of the four rotated sums. The weights of a layer
+// are divided into squares of 4 x 4 weights. Square (b, g) has the weights from the inputs 4 b .. 4 b + 3 to the
+// neurons 4 g .. 4 g + 3. Row r of square (b, g) is in column 4 b + r of `turned`, at the elements 4 g .. 4 g + 3. In
+// memory, the columns of the first WIDTH_STEP neurons are followed by the columns of the next WIDTH_STEP neurons.
 struct LayerView {
     int in, width;
     const float* bias;
@@ -65,8 +65,8 @@ struct NetworkView {
 //     start[k] + slope[k] u + factor[k] 2^(rate[k] u)
 //
 // If in_plane[k] is 1 instead of 0, the decoded value is multiplied by sin^2(theta_i), which goes to 0 towards normal
-// incidence. The arrays have `count` numbers, a multiple of WIDTH_STEP. They have zeros after the last output of the
-// network, and at least one such zero. From index `logarithmic` on, all factors are 0.
+// incidence. The arrays have `count` numbers, a multiple of WIDTH_STEP. After the last output of the network, the
+// arrays have at least one zero. From index `logarithmic` on, all factors are 0.
 struct Ranges {
     int count, logarithmic;
     const float *start, *slope, *factor, *rate, *in_plane;
