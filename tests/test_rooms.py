@@ -45,8 +45,8 @@ def test_the_drawing_has_every_room_and_every_arrow():
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (("cli", "attic"), "attic: on no floor"),
-        (("target", "adapter"), "target imports adapter: imports go down"),
+        (("cli", "attic"), "attic: not on any floor"),
+        (("target", "adapter"), "target imports adapter: a room imports only from lower floors"),
     ],
 )
 def test_imports_that_cannot_be_drawn_are_refused(more, told, monkeypatch):
@@ -88,7 +88,7 @@ def test_the_summary_of_a_room_is_the_longest_beginning_that_fits(tmp_path, monk
     assert rooms.summary("attic") == "Old things: chairs, tables (some broken)"
     assert rooms.summary("attic", lambda text: len(text) < 30) == "Old things: chairs, tables"
     assert rooms.summary("attic", lambda text: len(text) < 20) == "Old things"
-    with pytest.raises(ValueError, match="attic.py: no beginning of the first sentence fits"):
+    with pytest.raises(ValueError, match="attic.py: the first sentence of the docstring is too long"):
         rooms.summary("attic", lambda text: False)
     (tmp_path / rooms.PACKAGE / "attic.py").write_text(
         '"""Things that are old, and things that are broken."""'

@@ -1,1 +1,1 @@
-"""Scripts that write committed files, and a script that sets up a checkout."""
+"""Scripts for developers: they write generated files of the repository, and set up a checkout."""

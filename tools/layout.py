@@ -1,8 +1,8 @@
-"""Places boxes on floors, so that the arrows between them are straight and have few crossings.
+"""Computes the layout of a drawing of boxes on floors, so that the arrows are straight and have few crossings.
 
-The method is that of Sugiyama, Tagawa and Toda 1981. An arrow that passes a floor gets a place on this floor. The
-places of each floor are sorted by the mean positions of their neighbours. Then they are moved as close to these means
-as their order allows.
+The method is that of Sugiyama, Tagawa and Toda 1981. A *place* is a box, or the point where an arrow passes a floor.
+First, the places of each floor are sorted by the mean positions of the places that they are linked to. Then each place
+is moved as close to this mean position as the order of the places allows.
 """
 
 from __future__ import annotations
@@ -13,27 +13,30 @@ from itertools import pairwise
 from typing import NamedTuple
 
 Arrow = tuple[str, str]
-Place = str | tuple[str, str, int]  # a box, or the floor that an arrow passes: (upper box, lower box, floor)
+Place = str | tuple[str, str, int]  # a box, or a floor that an arrow passes: (upper box, lower box, floor)
 
 TRIES, SWEEPS = 60, 16
-# A piece of an arrow pulls its two ends together. The pull is STRAIGHT times as strong for each end that is not a box,
-# so that long arrows are straight where they pass floors.
+# A link is the part of an arrow between two neighbouring floors. The weight with which the layout shortens a link is
+# multiplied by STRAIGHT for each end of the link that is not a box, so that long arrows are straight where they pass
+# floors.
 STRAIGHT = 6.0
 
 
 class Layout(NamedTuple):
-    """The x of the centre of every place, and the places of every arrow from its upper to its lower end."""
+    """The x coordinate of the centre of every place, and for every arrow the list of its places from top to bottom."""
 
     x: dict[Place, float]
     ways: dict[Arrow, list[Place]]
 
 
 def layout(floors: Sequence[Sequence[str]], arrows: Sequence[Arrow], box: float, passage: float) -> Layout:
-    """Places the boxes of `floors`, highest first.
+    """Computes the layout.
 
     Args:
+        floors: the boxes of each floor; the highest floor comes first.
         arrows: pairs of an upper box and a box on a lower floor.
-        box, passage: widths of a box and of an arrow that passes a floor, with the space around them.
+        box: the width of a box, including the space around it.
+        passage: the width of an arrow that passes a floor, including the space around it.
     """
     rows, ways = _with_passages(floors, arrows)
     links = [link for way in ways.values() for link in pairwise(way)]
@@ -56,7 +59,7 @@ def _with_passages(
 
 
 def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> list[list[Place]]:
-    """Tries several orders of the places on the floors, and returns the order with the fewest crossings."""
+    """Tries several orders of the places on each floor, and returns the orders with the fewest crossings of links."""
     dice = random.Random(0)
     best, fewest = rows, float("inf")
     for _ in range(TRIES):
@@ -70,7 +73,11 @@ def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> l
 
 
 def _sort(rows: list[list[Place]], links: Sequence[tuple[Place, Place]], down: bool) -> None:
-    """Sorts every floor by the mean positions of its neighbours on the floor before. `down` starts at the top."""
+    """Sorts the places of every floor in turn by the mean positions of the places that they are linked to.
+
+    With `down`, the links to the floor above count, and the highest floor comes first. Without `down`, the links to the
+    floor below count, and the lowest floor comes first.
+    """
     for n in range(1, len(rows)) if down else range(len(rows) - 2, -1, -1):
         before = {place: k for k, place in enumerate(rows[n - 1 if down else n + 1])}
         found: dict[Place, list[int]] = {}
@@ -87,7 +94,7 @@ def _sort(rows: list[list[Place]], links: Sequence[tuple[Place, Place]], down: b
 
 
 def crossings(rows: Sequence[Sequence[Place]], links: Sequence[tuple[Place, Place]]) -> int:
-    """The number of crossings of the links between neighbouring floors."""
+    """The number of pairs of links that cross each other."""
     count = 0
     for upper, lower in pairwise(rows):
         above, below = ({place: k for k, place in enumerate(row)} for row in (upper, lower))
@@ -126,8 +133,10 @@ def _placed(
 
 
 def _rising(values: Sequence[float], weights: Sequence[float]) -> list[float]:
-    """The nondecreasing numbers that are nearest to `values`, by weighted squares. Neighbours that decrease are
-    replaced by their weighted mean."""
+    """The nondecreasing numbers with the smallest weighted squared distance to `values` (isotonic regression).
+
+    Neighbouring values that decrease are replaced by their weighted mean until no values decrease.
+    """
     merged: list[tuple[float, float, int]] = []
     for value, weight in zip(values, weights, strict=True):
         merged.append((value, weight, 1))

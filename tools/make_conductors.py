@@ -1,10 +1,10 @@
-"""Writes nma/conductors/conductors.csv: the indices of refraction of real metals, in linear sRGB.
+"""Writes nma/conductors/conductors.csv, which contains the refractive indices of real metals in linear sRGB.
 
     python tools/make_conductors.py [OUT.csv]
 
-Mitsuba projects every spectrum in its `data/ior` to linear sRGB without bounds, as its `conductor` plugin does. Two
-kinds of materials are dropped: transparent crystals, whose absorption k is near 0, and spectra with a negative channel
-that the projection had to clamp.
+Mitsuba's plugin `conductor` projects the spectra in its folder `data/ior` to linear sRGB, and this script reads the
+projected values. It omits transparent crystals, whose absorption k is near 0. It also omits spectra whose projection
+has a negative channel, which Mitsuba clamps to 0.
 """
 
 import argparse
@@ -18,23 +18,25 @@ from nma.files import write_text
 OUT = Path(__file__).parents[1] / "nma" / "conductors" / "conductors.csv"
 HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
 
-# A material with a lower k than this in any channel is a tinted dielectric. The next material above has .114.
+# A material whose k is below this limit in any channel is a tinted dielectric, and is omitted. The smallest k of all
+# other materials is .114.
 MIN_K = 0.1
 
-# These substances are kept out of training, to test unseen metals: an alkali, a refractory, a bright and a liquid
-# metal, a gold-like nitride, one whose eta rises towards blue, a weakly absorbing oxide and amorphous carbon. Mitsuba
-# has many substances twice (`Hg`, `Hg_palik`). All rows of a substance are kept out together; otherwise the test would
-# contain training data.
+# These substances are not used for training, so that they can test adapters on unseen metals. They are an alkali metal,
+# a refractory metal, a bright metal, a liquid metal, a nitride that looks like gold, a metal whose eta rises towards
+# blue, a weakly absorbing oxide, and amorphous carbon. Mitsuba has several data files for some substances (`Hg`,
+# `Hg_palik`). None of the files of a test substance is used for training; otherwise the test would contain training
+# data.
 HELD_OUT = ("Na", "W", "Rh", "Hg", "TiN", "Ta", "Cu2O", "a-C")
 
 
 def substance(name: str) -> str:
-    """The substance of a data file: `Hg_palik` is `Hg`, `Te-e` (extraordinary ray) is `Te`."""
+    """The substance of a data file: `Hg` for `Hg_palik`, and `Te` for `Te-e` (the extraordinary ray of tellurium)."""
     return name.removesuffix("_palik").removesuffix("-e")
 
 
 def project(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Linear sRGB (eta, k), each (3,), of the conductor `name` as Mitsuba's plugin holds it."""
+    """The refractive index (eta, k) of the conductor `name` in linear sRGB, as Mitsuba projects it; each (3,)."""
     values = mi.traverse(mi.load_dict({"type": "conductor", "material": name}))
     return np.array(values["eta.value"], float).ravel(), np.array(values["k.value"], float).ravel()
 
@@ -47,7 +49,7 @@ def main() -> None:
     out = parser.parse_args().out
 
     mi.set_variant("scalar_rgb")
-    mi.set_log_level(mi.LogLevel.Error)  # Mitsuba warns about every colour that it clamps
+    mi.set_log_level(mi.LogLevel.Error)  # otherwise Mitsuba prints a warning for every colour that it clamps
     files = (Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")
     names = sorted((f.name.removesuffix(".eta.spd") for f in files), key=lambda name: (name.lower(), name))
 

@@ -1,9 +1,10 @@
-"""Draws the rooms of the package, the imports between them, and the way that data takes through them.
+"""Draws the rooms of the package, the imports between the rooms, and the path of the data through the rooms.
 
     python -m tools.map [OUT.svg]     draws docs/images/architecture.svg and lists the rooms
 
-The floors come from the contract in pyproject.toml. The arrows are read from the code: an arrow from A to B means that
-A imports B. The arrow is left out if A also reaches B through other rooms.
+A room is a module or a package directly in `nma/`. The floors of the rooms are read from the contract in
+pyproject.toml, and the imports are read from the code. A thin arrow from room A to room B means that A imports B. The
+arrow is omitted if A also imports B indirectly, through other rooms.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from tools import rooms
 from tools.layout import Arrow, Layout, Place, layout
 
 OUT = Path(__file__).parents[1] / "docs/images/architecture.svg"
-# The box outside the package: its name, what it is, and a room on the same floor.
+# A box for the C++ runtime, which is outside the package: its name, its text, and a room whose floor it shares.
 OUTSIDE = ("runtime/", "The adapter in C++, for any renderer", "render")
 
 
 class Step(NamedTuple):
-    """One step of the data: from one room to another, and what is passed on."""
+    """One step of the data: the room that passes the data on, the room that receives it, and the kind of data."""
 
     start: str
     end: str
@@ -46,7 +47,7 @@ WAY = (
 
 BOX, HEIGHT, GAP, RISE, PASSAGE, PORT = 210, 94, 14, 58, 16, 13  # px
 MARGIN, LABEL = 18, 20
-LETTERS, LINES = 26, 4  # of the text that says what a room is: letters per line, and lines
+LETTERS, LINES = 26, 4  # the most letters per line, and the most lines, of the text in a box
 STYLE = """\
 text { font-family: "Helvetica Neue", Helvetica, Arial, "DejaVu Sans", sans-serif; fill: #23303d }
 .name { font-family: Menlo, Consolas, "DejaVu Sans Mono", monospace; font-weight: bold; font-size: 16px }
@@ -76,7 +77,7 @@ def main() -> None:
 
 
 def listing() -> str:
-    """A line of text for each room, with its floor; the highest floor comes first."""
+    """A text with one line for each room, which gives its floor and its purpose. The highest floor comes first."""
     lines = []
     for number, floor in reversed(list(enumerate(reversed(rooms.floors()), start=1))):
         lines += [f"{number}  {room:11} {rooms.summary(room)}" for room in floor]
@@ -84,13 +85,13 @@ def listing() -> str:
 
 
 class Plan(NamedTuple):
-    """The positions of all boxes and arrows. Floor 0 is the highest."""
+    """The positions of all boxes and arrows of the drawing. The highest floor has the index 0."""
 
     floors: list[list[str]]
     imports: frozenset[Arrow]
-    steps: dict[Arrow, Step]  # the key is the upper and the lower room of a step
+    steps: dict[Arrow, Step]  # each key is the pair of the upper and the lower room of a step
     layout: Layout
-    ports: dict[tuple[Arrow, str], float]  # x of an arrow's end at a box, relative to the box's centre
+    ports: dict[tuple[Arrow, str], float]  # x of an arrow's end at a box, relative to the centre of the box
     left: float
 
     def x(self, place: Place) -> float:
@@ -118,11 +119,13 @@ def plan() -> Plan:
 
 
 def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
-    """Exits with a message if an import cannot be drawn, or if a step of the data has no import."""
+    """Exits with a message if an import cannot be drawn, or if the two rooms of a step do not import each other."""
     if unknown := {room for arrow in imports for room in arrow if room not in level}:
-        sys.exit(f"{', '.join(sorted(unknown))}: on no floor; add it to the contract in pyproject.toml")
+        sys.exit(
+            f"{', '.join(sorted(unknown))}: not on any floor; add the room to the contract in pyproject.toml"
+        )
     if upwards := [f"{a} imports {b}" for a, b in sorted(imports) if level[a] >= level[b]]:
-        sys.exit(f"{'; '.join(upwards)}: imports go down; see `make lint`")
+        sys.exit(f"{'; '.join(upwards)}: a room imports only from lower floors; see `make lint`")
     for step in WAY:
         ends = {(step.start, step.end), (step.end, step.start)}
         if step.end != OUTSIDE[0] and not ends & imports:
@@ -130,7 +133,10 @@ def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
 
 
 def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], float]:
-    """Spreads the arrows at each side of a box. Their order follows the boxes at their other ends."""
+    """Spreads the ends of the arrows along the upper and the lower side of each box.
+
+    At each side, the ends have the same order as the places at which the arrows arrive on the neighbouring floor.
+    """
     sides: dict[tuple[str, bool], list[tuple[float, Arrow]]] = {}
     for arrow in arrows:
         way = placed.ways[arrow]
@@ -151,7 +157,7 @@ def drawing() -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {p.width} {height}" {size}>',
         "<!-- Drawn by `python -m tools.map`; do not edit. -->",
-        f"<title>The rooms of {rooms.PACKAGE}, what they import, and the way of the data</title>",
+        f"<title>The rooms of {rooms.PACKAGE}, their imports, and the path of the data</title>",
         f"<style>\n{STYLE}\n</style>\n<defs>\n{MARKERS}\n</defs>",
         f'<rect {size} rx="8" fill="#ffffff"/>',
         *_bands(p),
@@ -166,12 +172,12 @@ def drawing() -> str:
 
 
 def _top(level: int) -> int:
-    """The upper edge of the boxes on a floor, in pixels."""
+    """The y coordinate of the upper edge of the boxes on the floor `level`, in pixels."""
     return MARGIN + 8 + level * (HEIGHT + RISE)
 
 
 def _bands(p: Plan) -> list[str]:
-    """Draws a stripe behind each floor, with the floor's number."""
+    """Draws a stripe behind the boxes of each floor, with the number of the floor."""
     parts = []
     for level in range(len(p.floors)):
         top, width = _top(level) - 8, p.width - 2 * MARGIN
@@ -201,7 +207,7 @@ def _lines(text: str) -> list[str]:
 
 
 def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
-    """Draws a line between two boxes. The line is straight where it passes a floor."""
+    """Draws an arrow between two boxes. The arrow is straight where it passes a floor."""
     points = _points(p, arrow)
     if upwards:
         points.reverse()
@@ -213,8 +219,11 @@ def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
 
 
 def _points(p: Plan, arrow: Arrow) -> list[tuple[int, int]]:
-    """The points of an arrow, from top to bottom: it leaves the upper box, enters and leaves every floor that it
-    passes, and ends at the lower box."""
+    """The points of an arrow from top to bottom.
+
+    The first point is at the upper box and the last point at the lower box. For every floor that the arrow passes,
+    there is one point where it enters and one point where it leaves this floor.
+    """
     upper, lower = arrow
     level = p.level(upper)
     points = [(p.x(upper) + p.ports[arrow, upper], _top(level) + HEIGHT)]
@@ -235,16 +244,16 @@ def _number(number: int, x: int, y: int) -> str:
 
 
 def _legend(p: Plan) -> list[str]:
-    """The legend: the meaning of the arrows, and the steps of the data."""
+    """Draws the legend: the meaning of the two kinds of arrows, and the list of the steps of the data."""
     left, top = MARGIN + 12, _top(len(p.floors)) + 4
     told = (
-        "The upper room imports the lower one. No arrow is drawn where a longer way leads to the same room."
+        "The upper room imports the lower room. An import is not drawn if it also exists through other rooms."
     )
     parts = [
         f'<path class="import" d="M{left} {top - 4}h34"/>',
         f'<text class="legend" x="{left + 46}" y="{top}">{told}</text>',
         f'<path class="way" d="M{left} {top + 18}h30"/>',
-        f'<text class="legend" x="{left + 46}" y="{top + 22}">The data goes this way:</text>',
+        f'<text class="legend" x="{left + 46}" y="{top + 22}">The path of the data:</text>',
     ]
     for n, step in enumerate(WAY, start=1):
         y = top + 22 * (n + 1)

@@ -1,7 +1,8 @@
-"""The rooms of the package, their floors and the imports between them.
+"""Reads the rooms of the package, their floors and the imports between them.
 
-A room is a module or a package directly in `nma/`. Its floor is defined in pyproject.toml, in the contract that
-`make lint` checks. Its imports are read from the code. Imports inside functions, and imports for type checkers, count.
+A room is a module or a package directly in `nma/`. The floor of each room is read from pyproject.toml, where the
+contract that `make lint` checks lists the floors. The imports of each room are read from the code. They include imports
+inside functions and imports that only type checkers execute.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Arrow = tuple[str, str]  # from the importing room to the imported room
 
 @cache
 def floors() -> tuple[tuple[str, ...], ...]:
-    """The rooms of each floor in the contract, highest floor first."""
+    """The rooms of each floor that the contract lists. The highest floor comes first."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
     (contract,) = (found for found in settings["contracts"] if found["id"] == CONTRACT)
     return tuple(tuple(re.split(r"\s*\|\s*", layer)) for layer in contract["layers"])
@@ -33,7 +34,7 @@ def floors() -> tuple[tuple[str, ...], ...]:
 
 @cache
 def imports() -> frozenset[Arrow]:
-    """All imports of one room by another. `nma/__init__.py` does not count as a room."""
+    """All imports of one room by another room. `nma/__init__.py` does not count as a room."""
     graph = grimp.build_graph(PACKAGE, cache_dir=None)
     pairs = {
         (_room(module), _room(imported))
@@ -48,7 +49,7 @@ def _room(module: str) -> str:
 
 
 def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
-    """Removes every arrow from A to B for which other arrows also lead from A to B. There must be no circle."""
+    """Removes every arrow from A to B for which a path of other arrows leads from A to B. There must be no cycles."""
 
     @cache
     def below(room: str) -> frozenset[str]:
@@ -63,7 +64,7 @@ def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
 
 
 def circle(arrows: frozenset[Arrow]) -> list[str]:
-    """The rooms on a circle of imports, and the rooms above that lead to it; empty if there is no circle."""
+    """The rooms in cycles of imports, and the rooms that import these directly or indirectly. Empty without a cycle."""
     left = set(arrows)
     while True:
         importing = {a for a, _ in left}
@@ -74,9 +75,9 @@ def circle(arrows: frozenset[Arrow]) -> list[str]:
 
 
 def summary(room: str, fits: Callable[[str], bool] = lambda text: True) -> str:
-    """What a room is: the longest beginning of its docstring's first sentence that fits.
+    """A short description of a room: the longest beginning of its docstring's first sentence for which `fits` is true.
 
-    It ends at a colon, a semicolon or a parenthesis. If none of these beginnings fits, it ends at a comma.
+    The beginning ends before a colon, a semicolon or a parenthesis. If no such beginning fits, it ends before a comma.
     """
     place = ROOT / PACKAGE / room
     file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
@@ -86,4 +87,6 @@ def summary(room: str, fits: Callable[[str], bool] = lambda text: True) -> str:
         beginnings = list(itertools.accumulate(re.split(ends, sentence)))
         if found := [beginning for beginning in beginnings if fits(beginning)]:
             return found[-1]
-    raise ValueError(f"{file}: no beginning of the first sentence fits; write a shorter one")
+    raise ValueError(
+        f"{file}: the first sentence of the docstring is too long for the drawing; write a shorter sentence"
+    )
