@@ -4,11 +4,11 @@ python -m bench.density [--variant scalar_rgb llvm_ad_rgb] [--scene environment]
     [--rr-depth 5] [--quick] [--output out/bench]
 
 The material is a nearly white medium between a coat and silver. The medium hardly absorbs, so walks end only when they
-leave the material. The adapter was trained for extinctions up to sigma_t = 1, and clamps larger extinctions to 1. Its
-picture is wrong there, but this bench needs only the time. Each of the --runs rounds renders one frame with every BSDF
-at every extinction; the reported times are medians over the rounds. `nma curves` runs the network when the scene is
-loaded, `nma online` at every shading point. The flatness of a BSDF is its longest time over all extinctions, divided by
-its shortest time.
+leave the material. The adapter was trained for extinctions up to sigma_t = 1, and clamps larger extinctions to 1. The
+pictures of clamped adapters are wrong, but this bench measures only times. Each of the --runs rounds renders one frame
+with every BSDF at every extinction; the reported times are medians over the rounds. `nma curves` runs the network when
+the scene is loaded, `nma online` at every shading point. The flatness of a BSDF is its longest time over all
+extinctions, divided by its shortest time.
 
 Writes density.json and density.png.
 """

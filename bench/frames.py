@@ -38,13 +38,14 @@ Row = Mapping[str, Any]  # error measures and times by name; None stands for an 
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
 OUTPUT = Path("out/bench")
 REFERENCES = ROOT / "out/bench/references"
-# Frames with more samples than this are rendered in several passes, because one pass would need too much memory.
+# Frames with more than MOST_SAMPLES samples are rendered in several passes, because one would need too much memory.
 MOST_SAMPLES = 1 << 23
-# A converged picture is the mean of this many independent pictures (parts). Their variance gives the noise of the mean.
+# A converged picture is the mean of independent parts; the variance of the parts gives the noise of the mean. Numbers
+# of parts, for most scenes and for the teaser:
 PARTS, TEASER_PARTS = 4, 16
 # Converged pictures use seeds from REFERENCE_SEED upwards, frames use smaller seeds.
 REFERENCE_SEED = 1_000_000
-EVEN = 1.1  # the verdict is "even" if two efficiencies differ by less than this factor
+EVEN = 1.1  # the verdict is "even" if two efficiencies differ by less than the factor EVEN
 
 
 class Frames(NamedTuple):
@@ -180,7 +181,7 @@ def figures(frames: Frames, reference: Converged | None = None) -> dict[str, flo
 
 
 def ratios(own: Row, simulation: Row) -> dict[str, Any]:
-    """Returns time, variance, error and efficiencies relative to the simulation's; None for every unknown ratio."""
+    """Returns the ratios of time, variance, error and efficiencies to the simulation's; an unknown ratio is None."""
     time, variance, error = (ratio(own[key], simulation[key]) for key in ("seconds", "variance", "error"))
     return {
         "time": time,
@@ -218,7 +219,7 @@ def mean_doubt(rows: Sequence[Mapping[str, Row]], name: str, simulation: str) ->
 
 
 def verdict(efficiency: float | None) -> str:
-    """Returns which is more efficient: "adapter", "simulation", "even" or "-" (unknown).
+    """Returns which BSDF is more efficient: "adapter", "simulation", "even" or "-" (unknown).
 
     Args:
         efficiency: the adapter's efficiency by error, relative to the simulation's.

@@ -1,16 +1,14 @@
-"""How far adapters are from reciprocal: how much f(wi, wo) and f(wo, wi) differ.
+"""How far adapters are from being reciprocal: the difference between f(wi, wo) and f(wo, wi).
 
 python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
 
 An adapter's network computes the blend's parameters for the view direction, so f(wi, wo) and f(wo, wi) differ. Paths
-from the camera use f(wi, wo), paths from a light would use f(wo, wi). This bench needs no renderer: it averages both
-functions over directions wo that are sampled from the blend. It prints a table with a row for each named material and
-these columns:
+from the camera use f(wi, wo), paths from a light would use f(wo, wi). This bench needs no renderer: it averages f(wi,
+wo) and f(wo, wi) over directions wo that are sampled from the blend. The bench prints a table with a row for each named
+material and these columns:
 
-difference      the mean of |f(wi, wo) - f(wo, wi)| over all pairs of directions, weighted by both cosines and divided
-                by the mean of f
-cos .9, .5, .2  the relative change of brightness under a uniform sky if the two directions are swapped, for a surface
-                that is seen at the cosine .9, .5 or .2
+difference      mean of |f(wi, wo) - f(wo, wi)|, weighted by both cosines, divided by the mean of f
+cos .9, .5, .2  relative change of brightness if wi and wo are swapped, under a uniform sky, at this cosine of theta_i
 
 Writes reciprocity.json.
 """

@@ -1,4 +1,4 @@
-"""Time, variance and error of `principled`, `layered` and `nma` in the preview scene, with no textures and with three.
+"""Time, variance and error of `principled`, `layered` and `nma` in the preview scene, with and without textures.
 
     python -m bench.render [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
 
@@ -9,9 +9,11 @@ ratio       a frame's time relative to `principled` in the same round, median ov
 compile     extra time of the first frame over the second, with an empty cache of kernels and no other BSDF
 variance    variance of one frame over independent seeds, averaged over pixels and channels
 efficiency  1 / (variance x time)
-bias        root mean square difference between the expected picture and that of `layered`, estimated from products of
-            independent renderings; an upper limit (<) if the bias is not larger than its statistical error
+bias        root mean square difference between the expected picture and the expected picture of `layered`
 smape       SMAPE between the mean of the frames and the reference; in the row of `layered`, this error is noise only
+
+The bias is estimated from products of independent renderings. If the squared bias is at most twice its standard error,
+the table shows an upper limit of the bias (<).
 
 The machine's load average is printed before and after the table. `principled` shows another material, so only its time
 and its noise are of interest.
@@ -155,8 +157,8 @@ def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array])
 def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
     """Estimates the squared bias, averaged over pixels and channels, and the standard error of the estimate.
 
-    For each pair of frames (a, b), the estimate averages (a - halves[0]) (b - halves[1]). The two factors share no
-    samples, so the noise has mean 0 in the product.
+    The estimate is the mean of (a - halves[0]) (b - halves[1]) over all pairs (a, b) of different frames. The two
+    factors share no samples, so the noise has mean 0 in the product.
     """
     a, b = pictures - halves[0], pictures - halves[1]
     pairs = len(pictures) * (len(pictures) - 1)

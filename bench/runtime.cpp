@@ -1,4 +1,5 @@
-// Measures the C++ runtime, and prints one line of JSON for each measurement. bench/runtime.py compiles and runs it.
+// Measures the C++ runtime, and prints one line of JSON for each measurement. bench/runtime.py compiles and runs
+// this program.
 //
 //     ./runtime NAME=WEIGHTS ...
 //

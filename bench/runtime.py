@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-# The number of threads must be set before NumPy starts its threads.
+# The number of threads of OpenBLAS must be set before NumPy loads OpenBLAS.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import drjit as dr

@@ -3,11 +3,11 @@
 python -m bench.samples [--variant scalar_rgb] [--size 144] [--spp 1024] [--runs 3] [--reference-spp 8192]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-Frames are rendered with 1, 2, 4 ... --spp samples per pixel. For each of these sample counts, at least --runs frames
-are rendered with each BSDF. The squared error is measured against a converged picture of `layered`, and the noise of
-this picture is subtracted. With more samples, the simulation's error falls towards 0, but an adapter's error falls only
-to its squared bias. The parts of the converged picture are kept in out/bench/references, so a killed run continues
-where it stopped. bench/frames.py defines variance, error and efficiency.
+Frames are rendered with 1, 2, 4 ... --spp samples per pixel. For each number of samples per pixel, at least --runs
+frames are rendered with each BSDF. The squared error is measured against a converged picture of `layered`, and the
+noise of this picture is subtracted. With more samples, the simulation's error falls towards 0, but an adapter's error
+falls only to its squared bias. The parts of the converged picture are kept in out/bench/references, so a killed run
+continues where it stopped. bench/frames.py defines variance, error and efficiency.
 
 Writes samples.json and samples.png.
 """
@@ -25,7 +25,7 @@ import nma
 from bench import frames, scenes
 from figures import common
 
-# With fewer than CHEAP samples per pixel, CHEAP / spp frames are rendered for each of the --runs frames.
+# With few samples per pixel (spp), CHEAP / spp times as many frames are rendered.
 CHEAP = 32
 Curve = dict[int, dict[str, float | None]]
 
@@ -77,7 +77,7 @@ def measure(
 
 
 def repeats(spp: int, runs: int) -> int:
-    """Returns how many frames to render. More are rendered with few samples: they take little time and vary most."""
+    """Returns how many frames to render: more frames with few samples, which take little time and vary most."""
     return runs * max(1, CHEAP // spp)
 
 

@@ -90,7 +90,7 @@ def network(subject: Subject, name: str, precision: str = "compact") -> dict[str
 
 
 def stand_in(subject: Subject) -> dict[str, Any]:
-    """Returns Mitsuba's `principled` with the same textures. It shows another material than `layered`."""
+    """Returns Mitsuba's `principled` with the subject's textures, but with another material."""
     names = {"albedo": "base_color", "alpha_bottom": "roughness", "sigma_t": "metallic"}
     images = {names[name]: image for name, image in subject.images().items()}
     return {"type": "principled", "metallic": 0.7, "roughness": 0.3, "clearcoat": 0.5} | images
@@ -228,7 +228,7 @@ def _path(rr_depth: int) -> dict[str, Any]:
 
 
 def _light(towards: tuple[float, ...], distance: float, colour: tuple[float, ...]) -> dict[str, Any]:
-    """A small sphere that emits light. Its radiance grows with distance^2, so all lights light the ball equally."""
+    """A small spherical light. Its radiance grows with distance^2, so all lights illuminate the ball equally."""
     direction = np.array(towards) / np.linalg.norm(towards)
     radiance = (LIGHT_POWER * distance**2 * np.array(colour)).tolist()
     return {

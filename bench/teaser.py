@@ -3,11 +3,11 @@
 python -m bench.teaser [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3] [--reference-spp 2048]
     [--adapter layered3-5x64] [--rr-depth 5] [--quick] [--output out/bench]
 
-The scene has three shader balls. The parameters of their materials come from textures, so the network runs at every
-shading point. A table below the pictures shows, for simulation and adapter, the median time of a frame, the variance,
-the squared error and the SMAPE against the converged picture. Its last row shows the adapter's values and efficiencies
-relative to the simulation. bench/frames.py defines variance, squared error and efficiency. The parts of the converged
-picture are kept in out/bench/references, so a killed run continues where it stopped.
+The scene has three shader balls with textured materials, so the network runs at every shading point. A table below the
+pictures shows, for simulation and adapter, the median time of a frame, the variance, the squared error and the SMAPE
+against the converged picture. The table's last row shows the adapter's values and efficiencies relative to the
+simulation. bench/frames.py defines variance, squared error and efficiency. The parts of the converged picture are kept
+in out/bench/references, so a killed run continues where it stopped.
 
 Writes teaser.json and teaser.png.
 """

@@ -61,7 +61,7 @@ def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
 
 
 def reference(name: str, quick: bool) -> nma.Tables:
-    """Returns the reference tables of a set in SETS. If their file does not exist, `nma simulate` makes the file."""
+    """Returns the reference tables of a set in SETS, made by `nma simulate` if their file does not exist."""
     count, population, seed = SETS[name]
     count, walks = (4, 4_000_000) if quick else (count, REFERENCE_WALKS)
     path = REFERENCES / f"{name}-{count}x{walks}.npz"
@@ -109,5 +109,5 @@ def figures(
 
 
 def row(angle: float, rows: int) -> int:
-    """Returns the index of the table row that contains the angle of incidence `angle` [degrees], of `rows` rows."""
+    """Returns the index of the row with the angle of incidence `angle` [degrees], in a table of `rows` rows."""
     return min(int(math.cos(math.radians(angle)) * rows), rows - 1)

@@ -43,7 +43,7 @@ class Evaluator(NamedTuple):
 
 
 def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
-    """Returns the adapter's recipe, with the settings changed that do not suit the direct evaluator."""
+    """Returns the adapters' recipe, with a few settings changed for the direct evaluator."""
     return preset(
         "class",
         network=network_name,

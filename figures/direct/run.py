@@ -4,9 +4,9 @@
 
 First trains a direct evaluator on the adapters' dataset: a decoder, and a latent code for each material (evaluator.py).
 Then fits latent codes for the 89 validation materials to the materials' own references, as the paper does for Fan et
-al. 2022. The adapters have not seen these references: their input is the materials' parameters. The direct evaluator
-and the adapters are evaluated at random points in every bin, and the values are averaged over each bin. A killed
-training continues from its checkpoint in out/figures/direct.
+al. 2022. The adapters were not trained on these references: they compute the BRDF from the materials' parameters. The
+direct evaluator and the adapters are evaluated at random points in every bin, and the values are averaged over each
+bin. A killed training continues from its checkpoint in out/figures/direct.
 
 Writes direct.json, direct.md and direct.png beside this file. With --quick, trains a small network and writes to
 out/figures/direct.
@@ -103,7 +103,7 @@ def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict
     kept.mkdir(parents=True, exist_ok=True)
     settings, tables = data(arguments.data, quick)
     how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
-    # The decoder's training does not depend on the validation set, so its file name does not contain the set.
+    # The decoder's training does not depend on the validation set, so its file name does not name the set.
     stem = f"{how.network}_{settings.materials}_{how.steps}-steps"
     record: dict[str, Any] = {"dataset": asdict(settings)}
     with console.TrainingBar(how, "decoder") as bar:
@@ -178,7 +178,7 @@ def judge(evaluate: Evaluate, reference: nma.Tables, per_bin: int) -> dict[str, 
         materials.append(table_metrics(mean, table, reference.error[number]))
     rounded = [{k: round(m[k], 6) for k in COLUMNS} for m in materials]
     means = {k: round(v, 6) for k, v in mean_metrics(materials).items()}
-    # The time of the first material includes compilation. The median ignores this outlier.
+    # The time of the first material includes compilation, but the median ignores this outlier.
     return {
         "mean": means,
         "seconds": round(float(np.median(seconds)) * PAPER_POINTS, 2),

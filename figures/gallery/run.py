@@ -1,4 +1,4 @@
-"""Pictures of the named materials in the preview scene, and the noise of pictures in its two lightings.
+"""Pictures of the named materials in the preview scene, and the noise of pictures in the two lightings.
 
     python -m figures.gallery.run [--quick] [--adapter FILE]
 

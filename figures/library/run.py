@@ -133,7 +133,7 @@ def tabulated(members: Sequence[Member], kept: Path) -> Tables:
 def trained(
     label: str, members: Sequence[Member], tables: Tables, recipe: Recipe, kept: Path
 ) -> tuple[Library, float]:
-    """Returns a library of the materials `members` and the seconds of its training. Trains only if no file exists."""
+    """Returns a library of the materials `members`, trained if its file does not exist, and the training's seconds."""
     path = kept / f"{label}_{recipe.steps}.safetensors"
     if not path.exists():
         record = {"data": collection.origin(members), "materials": len(members)}
@@ -192,7 +192,7 @@ def rendered(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Renders the CELLS x CELLS grid of mixtures and the references of its corners.
 
-    Returns these pictures, and for each corner the FLIP of the fit and the FLIP of noise alone.
+    Returns the pictures, and for each corner the FLIP of the fit and the FLIP of noise alone.
     """
     by_name = {member.name: member for member in members}
     size, many = arguments.size, arguments.reference_spp

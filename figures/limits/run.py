@@ -4,8 +4,9 @@
 
 A fit is trained on the material that it is evaluated on, so its remaining error comes from the target. A class adapter
 with the same target has a larger error; the difference comes from the network, the data and the optimiser. The
-materials are the first --materials of the set "range", which is in random order. Each material is fitted to its
-reference and evaluated on the same reference. The metrics of finished materials are kept in out/figures/limits.
+materials are the first of the set "range", which is in random order; --materials is their number. Each material is
+fitted to its reference and evaluated on the same reference. The metrics of finished materials are kept in
+out/figures/limits.
 
 Writes limits.json and limits.png beside this file. With --quick, makes short fits to two materials and writes to
 out/figures/limits.

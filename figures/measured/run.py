@@ -5,8 +5,8 @@
 Fits a 3x32 network to each material, as `nma fit` does, and compares the fit with the material at 20,000 random pairs
 of directions and in a picture. Two other models are compared with the material at the same pairs of directions: the
 best constant Principled BRDF, and the NBRDF networks that Sztrajman et al. 2021 fitted to RGL's measurements. The
-measurements and the NBRDF networks are not part of this repository. They are read from the folders `rgl` and
-`rgl_nbrdf` in the folder `--data`; materials without a file are left out.
+measurements and the NBRDF networks are not part of this repository. The measurements are read from the folder `rgl` and
+the networks from the folder `rgl_nbrdf`, both inside the folder `--data`; materials without a file are left out.
 
 Writes measured.md, measured.json and measured.png beside this file. With --quick, trains briefly on two materials and
 writes to out/figures/measured.
@@ -48,7 +48,7 @@ from nma.train.principled import CONSTANT, fit_constant
 
 DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")
-# Ranges of cos(theta_i) and cos(theta_o), by the ending of the metrics' names. The NBRDF networks reach
+# Ranges of cos(theta_i) and cos(theta_o). The keys are endings of the metrics' names. The NBRDF networks reach
 # their published errors for cosines above .05, because grazing measurements are the hardest to fit.
 RANGES = {"": (0.02, 1.0), " from .05": (0.05, 1.0)}
 TIMED_PAIRS = 1 << 18

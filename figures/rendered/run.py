@@ -5,9 +5,9 @@
 
 The error of a picture with few samples per pixel is mostly noise. Therefore the adapters are compared with a converged
 simulation at an increasing number of samples per pixel. A second simulation is compared with the converged simulation
-in the same way. Its error is only noise, and shows how much of an adapter's error is noise. The script takes about two
-hours on one core. The pictures are kept in out/figures/rendered, so a killed run continues where it stopped, and
-processes with different --only can share the work.
+in the same way. The second simulation's error is only noise, and shows how much of an adapter's error is noise. The
+script takes about two hours on one core. The pictures are kept in out/figures/rendered, so a killed run continues where
+it stopped, and processes with different --only can share the work.
 
 Prints the tables of README.md, and writes tables.md, rendered.json, rendered.png and materials.png beside this file.
 With --quick, renders a few small pictures and writes to out/figures/rendered.
@@ -41,8 +41,8 @@ SIMULATION, AGAIN, SINGLE = "reference", "simulation again", "single"
 PAPER = {"flip_hdr": (0.0432, 0.89), "flip_ldr": (0.0352, 0.91)}
 # Weights of the variant "single", trained by figures/variants with its first seed.
 SINGLE_WEIGHTS = common.ROOT / "out/figures/variants/single_8000_6000-steps_seed-0.safetensors"
-# Correlated multi-jittered samples (Kensler 2013). Compared with independent samples at 64 samples per pixel, they
-# reduce the adapters' variance to a sixth, and the simulation's variance to two thirds.
+# Correlated multi-jittered samples (Kensler 2013). At 64 samples per pixel, multi-jittered samples reduce the
+# adapters' variance to a sixth of the variance with independent samples, and the simulation's variance to two thirds.
 SAMPLER = "multijitter"
 FIRST_LEVEL = 64
 # The second simulation has at most this many samples per pixel, enough to see how its noise falls.
@@ -65,8 +65,8 @@ class Subject(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The prefix of the pictures' file names. It contains a hash of the weights, so new weights are rendered
-        again."""
+        """The prefix of the pictures' file names, with a hash of the weights, so that pictures are rendered again for
+        new weights."""
         if self.weights is None:
             return f"layered_seed-{self.seed}"
         layers = nma.Adapter.load(self.weights).layers

@@ -21,8 +21,8 @@ from nma.render.progressive import render_passes
 
 WORST = 10
 LIMITS = """\
-- The adapter was trained for the class `layered3` within the ranges of its training data. It rejects parameters outside
-  these ranges, or clamps them to the ranges on request.
+- The adapter was trained for the class `layered3` within the ranges of its training data. The adapter rejects
+  parameters outside these ranges, or clamps parameters to the ranges on request.
 - The target's parameters depend on the view direction, so the BRDF is not reciprocal. Light tracing and bidirectional
   methods converge to a picture that differs from path tracing, unless they
   [prepare the blend for the camera's side](../../docs/mitsuba.md#reciprocity).

@@ -3,8 +3,8 @@
     python -m figures.slices.run [--quick] [--adapter FILE]
 
 A slice shows f cos(theta_o) for all directions wo, at 70 degrees or at normal incidence. The materials are taken from
-the set "range" (figures/common.py): the set is sorted by the roughness of the coat, and materials at even steps are
-chosen.
+the set "range" (figures/common.py): the set is sorted by the roughness of the coat, and materials at even
+intervals in this order are chosen.
 
 Writes slices.json and slices.png beside this file. With --quick, takes four materials with few walks, and writes to
 out/figures/slices.
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def chosen(tables: nma.Tables) -> nma.Tables:
-    """Chooses materials at even steps, in the order of the roughness of their coats."""
+    """Sorts materials by the roughness of the coat, and chooses materials at even intervals in this order."""
     order = np.argsort(tables.params[:, nma.LAYERED3.slices["alpha_top"]][:, 0])
     count = min(MATERIALS, len(order))
     picked = order[((np.arange(count) + 0.5) / count * len(order)).astype(int)]

@@ -69,7 +69,7 @@ class Gallery:
         return self._kept(job.stem, bsdf, self._view.spp, ADAPTER_SEED, newer_than=weights)
 
     def shipped(self, name: str) -> dict[str, float]:
-        """Returns the image metrics of a shipped adapter, averaged over the materials."""
+        """Returns the mean image metrics of a shipped adapter, which was trained on the same data for more steps."""
         pictures = self._kept(
             name, lambda m: material_bsdf(m, "nma", adapter=name), self._view.spp, ADAPTER_SEED
         )

@@ -73,7 +73,7 @@ def _errors(runs: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
     found = {"log loss": {name: run["tables"]["log_loss"] for name, run in runs.items()}}
     if all("images" in run for run in runs.values()):
         for metric in METRICS:
-            # A high SSIM is good, so its sign is changed to turn it into an error.
+            # A higher SSIM is better, so its sign is changed: then all values are errors.
             sign = -1.0 if metric == "ssim" else 1.0
             found[metric] = {name: sign * run["images"][metric] for name, run in runs.items()}
     return found

@@ -48,7 +48,7 @@ class Job:
     @property
     def recipe(self) -> Recipe:
         instances, directional = ALL[self.variant]
-        # A target stretched along the plane of incidence depends on wi, so a target that does not must be "principled".
+        # A stretched target depends on wi, so variants that do not depend on wi have the target "principled".
         target = None if directional else "principled"
         settings = {"instances": instances, "directional": directional, "target": target}
         return preset("class", **settings, steps=self.steps, seed=self.seed)
