@@ -52,7 +52,7 @@ def compiler() -> str:
 def measurements() -> Path:
     """The folder of measured materials: NMA_TEST_DATA, or shared/data beside the checkout.
 
-    The repository holds no measurements. Tests that need measurements are skipped if the folder is missing.
+    The repository holds no measurements. A test that needs measurements is skipped if the measurements are missing.
     """
     named = os.environ.get("NMA_TEST_DATA")
     folder = Path(named or Path(__file__).parents[2] / "shared/data")

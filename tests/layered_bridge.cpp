@@ -59,7 +59,7 @@ void layered_pdf(int n, const float* parameters, const float* wi, const float* w
     for (int i = 0; i < n; ++i) pdf[i] = layered::pdf(stack, density, vec(wi), vec(wo + 3 * i));
 }
 
-// Writes n densities. Each row has its own material, view direction and `wo`.
+// Writes n densities, each for its own material, view direction and `wo`.
 void layered_pdf_each(int n, const float* parameters, const float* wi, const float* wo, float* pdf) {
     constexpr int COLUMNS = nma::layered3::COLUMNS;
     for (int i = 0; i < n; ++i) layered_pdf(1, parameters + COLUMNS * i, wi + 3 * i, wo + 3 * i, pdf + i);

@@ -1,5 +1,5 @@
-// The functions that tests of the runtime call in addition to the C interface. They evaluate the target on arrays, in
-// float and in double, and copy the parameters of a BRDF's instances to an array.
+// The functions that tests of the runtime call in addition to the C interface. The functions evaluate the target on
+// arrays, in float and in double, and copy the parameters of a BRDF's instances to an array.
 #include "nma.h"
 #include "nma_c.h"
 

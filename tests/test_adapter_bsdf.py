@@ -262,7 +262,7 @@ def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
 
 
 def test_a_shading_point_runs_the_network_once(weights, monkeypatch):
-    """A path tracer evaluates and samples a BSDF at each shading point, but runs its network only once there.
+    """A path tracer evaluates and samples a BSDF at each shading point, but runs the BSDF's network once per point.
 
     A failure means that the network runs more often than needed, and pictures take longer.
     """

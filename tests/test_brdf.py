@@ -131,7 +131,7 @@ def off(found, expected):
 
 @pytest.mark.parametrize("kind", IN_PLANE)
 def test_evaluating_a_blend_without_its_frame_is_wrong(kind):
-    """A blend evaluated without its frame is more than 40 % off.
+    """The values of a blend that is evaluated without its frame are more than 40 % off.
 
     So the other tests in this file would detect a BRDF that ignores its frame.
     """
@@ -158,15 +158,16 @@ def test_bounded_adapters_are_dimmed():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_targets_that_stretch_in_the_plane_of_incidence_have_a_frame(kind):
-    """BRDFs of all other targets have no frame, so that Dr.Jit does not record operations to compute a frame."""
+    """BRDFs whose target does not stretch lobes have no frame, so that Dr.Jit does not record operations for it."""
     assert isinstance(prepared(kind, pairs()[0]).plane, Plane if kind in IN_PLANE else type(None))
 
 
 @pytest.mark.parametrize("kind", ISOTROPIC)
 def test_curves_and_numbers_describe_the_same_brdf(kind):
-    """`from_numbers` and `Curves.at` give the same BRDF as `prepare`, within 1e-5 and 1e-3.
+    """`from_numbers` gives the same BRDF as `prepare` within 1e-5, and `Curves.at` within 1e-3.
 
-    The difference of `from_numbers` is due to rounding in the network. Curves also interpolate between their nodes.
+    The difference of `from_numbers` is due to rounding in the network. The larger difference of `Curves.at` is due to
+    interpolation between the nodes of the curves.
     """
     wi, wo = pairs()
     own, expected = adapter(kind), prepared(kind, wi).eval(wi, wo)
@@ -185,7 +186,7 @@ def test_an_anisotropic_adapter_has_no_curves():
 
 
 def test_a_cosine_in_place_of_the_direction_is_refused():
-    """`prepare` took a cosine in older versions. The error message names a function that makes a direction of it."""
+    """`prepare` took a cosine in older versions. If it gets a cosine, an error message says how to make a direction."""
     adapter = Adapter.load("layered3-3x32")
     columns = list(LAYERED3.sample(np.random.default_rng(0), 2).T)
     for cosine in (0.5, np.array([0.5, 0.6]), mi.Float(0.5)):

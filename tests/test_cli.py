@@ -17,7 +17,7 @@ APP = typer.main.get_command(cli.app)
 COMMANDS = tuple(APP.commands)
 
 
-# Packages that take long to import. `nma --help` and `nma --version` must not import them.
+# Packages that take long to import, so that `nma --help` and `nma --version` must not import them.
 HEAVY = ("numpy", "mitsuba", "drjit", "jax", "zarr", "PIL", "matplotlib")
 
 

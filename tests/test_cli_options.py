@@ -82,7 +82,7 @@ def test_an_unknown_choice_is_wrong_usage(nma, tmp_path, monkeypatch, words):
 def test_an_output_must_have_the_ending_of_its_format(nma, tmp_path, monkeypatch, words, ending):
     """A command refuses an output file whose name has a wrong ending, because no command would read this file.
 
-    The refusal comes before any other work.
+    The command checks the name before any other work.
     """
     monkeypatch.chdir(tmp_path)
     for name in ("x", "x.bin"):

@@ -41,7 +41,7 @@ def _renders_nothing(monkeypatch):
 
 @pytest.fixture
 def bad(tmp_path, monkeypatch):
-    """The current folder, which contains a file named `file`. No output can be written to a path below that file."""
+    """The current folder, which contains a file named `file`. No output can be written to a path like `file/x`."""
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("mine")
     return tmp_path

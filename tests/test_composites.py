@@ -38,7 +38,7 @@ INTEGRATORS = {
 @pytest.fixture(autouse=True)
 def _variant():
     nma.render.use("llvm_ad_rgb")
-    gc.collect()  # otherwise Dr.Jit would also record the BSDFs of deleted scenes
+    gc.collect()  # deletes old scenes, because Dr.Jit would record their BSDFs too
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +77,8 @@ def normalmap(bsdf):
     return {"type": "normalmap", "normalmap": bitmap_texture(up), "a": bsdf}
 
 
-# The composites, each with two values: a function that makes the composite from a BSDF, and three weights. The picture
-# of the composite is the sum of three pictures with these weights: of the BSDF, of the diffuse BSDF, and of the sky.
+# The composites, each with a function that makes the composite from a BSDF, and with three weights. The picture of the
+# composite is a sum of three pictures with the three weights: of the BSDF, of the diffuse BSDF, and of the sky.
 COMPOSITES = {
     "blendbsdf": (blend, (1 - WEIGHT, WEIGHT, 0.0)),
     "mask": (mask, (OPACITY, 0.0, 1 - OPACITY)),
@@ -192,8 +192,8 @@ def scores(found, bsdfs):
         expected = sum(w * m for w, (m, _) in zip(weights, terms, strict=True))
         spread = variance + sum(w * w * v for w, (_, v) in zip(weights, terms, strict=True))
         z = (mean - expected) / np.sqrt(spread + (1e-4 * expected) ** 2 + 1e-14)
-        # The channels after the first three are albedos. They are not compared for composites with Mitsuba's `mask`,
-        # because `mask` does not multiply albedos by its opacity.
+        # The channels after the first three are albedos. Albedos are not compared for composites with Mitsuba's
+        # `mask`, because `mask` does not multiply albedos by its opacity.
         result[f"{name} in {composite}"] = z[:3] if "mask" in composite or composite == "nested" else z
     return result
 
@@ -217,7 +217,9 @@ def test_composites_are_linear_combinations(bsdfs, integrator):
 
 @pytest.mark.parametrize("name", ("nma, textured", "nma, anisotropic", "layered"))
 def test_composites_render_in_the_integrator_direct(bsdfs, name):
-    """The picture of a composite is finite and not black with `direct`, which evaluates and samples in separate calls.
+    """The integrator `direct` renders pictures of composites that are finite and not black.
+
+    Unlike a path tracer, `direct` evaluates and samples a BSDF in separate calls.
 
     Only the slow test `test_composites_are_linear_combinations` compares the values of pictures.
     """

@@ -1,4 +1,4 @@
-"""Datasets on disk: they have the same bytes however they were made, and incomplete ones give clear errors."""
+"""Datasets on disk: they have the same bytes however they were made, and incomplete datasets give clear errors."""
 
 import json
 import os

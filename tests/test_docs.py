@@ -89,7 +89,7 @@ def test_python_blocks_that_train_run(name, cheap, request):
 def run_block(text, folder):
     """Runs a code block as a program and returns the variables of the program.
 
-    Asserts that its pictures are finite and that the files it writes are not empty.
+    Asserts that the pictures of the program are finite and that its files are not empty.
     """
     text = text.replace("range(30)", "range(2)")
     if "__main__" in text:
@@ -114,7 +114,7 @@ def small_library():
 
 @pytest.mark.parametrize("name", blocks("cpp"))
 def test_cpp_blocks_of_the_pages_compile_and_run(name, compiler, tmp_path):
-    """A C++ block compiles and runs as the body of `main`, after declarations of the variables that it assumes."""
+    """A C++ block compiles and runs as the body of `main`, after declarations of the variables that the block uses."""
     includes, lines = blocks("cpp")[name].split("\n\n", 1)
     given = "float parameters[13] = {.02f, .1f, 1.5f, .1f, .4f, 1.4f, 4.f, 2.4f, 1.6f, .9f, .3f, .2f, .5f};\n"
     given += "const nma::Direction wi{.6f, 0.f, .8f}, wo{0.f, .6f, .8f};\nconst float u0 = .1f, u1 = .2f, u2 = .3f;\n"
@@ -133,7 +133,7 @@ def test_cpp_blocks_of_the_pages_compile_and_run(name, compiler, tmp_path):
 
 
 def test_links_between_pages_lead_somewhere():
-    """Every link of a page leads to an existing file, and to an existing heading of that file if it names one."""
+    """Every link of a page leads to an existing file. If a link names a heading, the file contains this heading."""
     broken = []
     for page in PAGES:
         for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):

@@ -22,7 +22,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/REA
 
 
 def lines(page):
-    """Returns the commands of a page: all lines of code blocks that name no language. Comments are removed."""
+    """Returns the commands of a page: all lines of code blocks that name no language, after removal of comments."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.M | re.S)
     text = "".join(body for language, body in blocks if not language)
     return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]

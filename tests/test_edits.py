@@ -203,7 +203,7 @@ WRONG_AT_LOAD = {
 def test_a_refused_bsdf_does_not_stop_other_scenes(adapter, kind):
     """Scenes still render while an error object keeps a reference to a BSDF that was refused.
 
-    Notebooks keep error objects in this way.
+    Notebooks, for example, keep the last error object.
     """
     expected = picture(scene(LAYERED))
     with pytest.raises(RuntimeError) as error:
@@ -291,7 +291,7 @@ def shared_key(params, leaf):
 def test_edits_of_shared_textures_show_and_are_checked(adapter, kind):
     """Our BSDF uses and checks the edits of a texture that it shares with another object.
 
-    Mitsuba notifies only the other object of such edits.
+    When the shared texture is edited, Mitsuba notifies only the other object.
     """
     shared = {"type": "ref", "id": "shared"}
     first = {"type": "sphere", "center": [0, 0, -9], "bsdf": {"type": "diffuse", "reflectance": shared}}
@@ -337,7 +337,7 @@ def test_shared_constants_have_gradients(adapter):
 @pytest.mark.parametrize("clamp", (False, True))
 @pytest.mark.parametrize("textured", (False, True))
 def test_values_on_a_bound_have_gradients(adapter, clamp, textured):
-    """The derivative by a parameter on its lower bound is the derivative just above it, within 5 %.
+    """The derivative by a parameter on its lower bound is the derivative just above the bound, within 5 %.
 
     A failure means that an optimisation cannot change black texels.
     """

@@ -129,7 +129,7 @@ def test_the_stated_error_of_integration_covers_the_actual_error(name, slope):
 
 @pytest.mark.parametrize("name", ("alpha .001", "coats of .001 over paint"))
 def test_albedos_are_those_of_the_target(name):
-    """The albedo of a row, 2 pi times its mean, is the mean weight of samples of the target (Z-test).
+    """The albedo of a row, which is 2 pi times the row's mean, equals the mean weight of the target's samples (Z-test).
 
     The false-alarm rate is `FALSE_ALARM` over all rows together; seeds are fixed.
     """
@@ -209,7 +209,7 @@ def test_references_that_cannot_be_compared_are_refused():
 def test_materials_beyond_the_training_range_are_refused_or_clamped():
     """An evaluation refuses a parameter beyond the training range, or clamps it on request.
 
-    Otherwise the figures of merit would measure how well the network extrapolates.
+    With parameters beyond the training range, figures of merit would measure how well the network extrapolates.
     """
     layers = [
         (
@@ -269,13 +269,13 @@ def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
     error = scale * rng.uniform(0.0, 1.0, 500)
     noise = np.maximum(b + error * rng.standard_normal((20_000, 500)), -0.999)
     expected = np.abs(np.log1p(noise) - np.log1p(b)).mean()
-    # The noise floor is a sum over 16 positive and 16 negative noise values. For small noise the logarithm is almost
-    # linear, and the sum is almost exact. For large noise the sum is less precise.
+    # The noise floor is a sum over 16 positive and 16 negative noise values. For small noise the noise floor is almost
+    # exact, because the logarithm is almost linear. For large noise the noise floor is less precise.
     assert noise_floor(b, error) == pytest.approx(expected, rel=0.004 if scale < 1.0 else 0.03)
 
 
 def test_counting_errors_are_exact_for_walks_of_throughput_1():
-    """If all walks have throughput 1, the standard deviation of a bin is that of `counting_error`, within 5 %.
+    """If all walks have throughput 1, the standard deviation of a bin is the value of `counting_error`, within 5 %.
 
     The count of walks in the bin is binomial, and eq. 9 of the paper converts the count to a value. `counting_error`
     leaves out the factor sqrt(1 - p) of the binomial, where p is the probability of the bin.

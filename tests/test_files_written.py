@@ -13,10 +13,10 @@ ROOT = Path(__file__).parents[1]
 # Methods and functions that write, rename or copy files, on any object and in any module.
 WRITERS = {"write_text", "write_bytes", "save_file", "savez", "savez_compressed", "savefig", "tofile"}
 WRITERS |= {"NamedTemporaryFile", "mkstemp", "mkdtemp", "rename", "copytree", "copyfile", "copy2", "move"}
-# Functions that write or rename files. Their entries include the module, because other modules have functions of the
+# Functions that write or rename files. The module is part of each entry, because other modules have functions of the
 # same name.
 OF_MODULES = {"np.save", "json.dump", "os.replace"}
-# Blocks of these context managers fill a temporary file or folder, which gets its final name at the end.
+# Context managers whose blocks fill a temporary file or folder, which gets its final name at the end of the block.
 WHOLE = {"whole", "whole_folder"}
 ALLOWED = {
     "nma/files.py": "what all others go through",
@@ -59,8 +59,8 @@ def is_write(call: ast.Call) -> bool:
             if isinstance(arg, ast.Constant)
         ]
         return any(isinstance(text, str) and text[:1] in "wax" and len(text) < 4 for text in mode)
-    # `Path.replace`, which renames a file, has one argument. `str.replace` has two arguments, and `dataclasses.replace`
-    # has keyword arguments.
+    # A call of `replace` with one argument is `Path.replace`, which renames a file. `str.replace` has two arguments,
+    # and `dataclasses.replace` has keyword arguments.
     return name(call) == "replace" and "." in called and len(call.args) == 1 and not call.keywords
 
 

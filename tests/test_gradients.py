@@ -87,7 +87,7 @@ def replaced(params, key, value):
 def slopes(loaded, directions, step, spp, seeds):
     """Returns the derivatives of a picture's mean along each direction of change, by `prb` and by central differences.
 
-    Both results are dictionaries of arrays (seeds,), by the keys of `directions`.
+    The derivatives and the differences are dictionaries of arrays (seeds,), with the keys of `directions`.
     """
     params = mi.traverse(loaded)
     start = {key: np.array(params[key], np.float64).reshape(d.shape) for key, d in directions.items()}
@@ -96,7 +96,8 @@ def slopes(loaded, directions, step, spp, seeds):
         for key, value in start.items():
             replaced(params, key, value)
         params.update()
-        # `seed_grad` is the seed of the pass for derivatives. The pictures for the differences use the same seed.
+        # `seed_grad` is the seed of the pass that computes derivatives. Pictures for the central differences use the
+        # value of `seed_grad` as their seed.
         picture = mi.render(loaded, params, spp=spp, seed=seeds + seed, seed_grad=seed)
         dr.backward(dr.mean(picture, axis=None))
         for key, d in directions.items():

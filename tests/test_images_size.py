@@ -24,7 +24,7 @@ def _variant():
 
 
 def image(path, kind, width=7, height=5):
-    """Writes a black image file of this format and returns its path."""
+    """Writes a black image file of the given format and returns its path."""
     if kind in ("hdr", "pfm", "exr"):
         mi.Bitmap(np.zeros((height, width, 3), np.float32)).write(str(path))
     else:

@@ -1,6 +1,6 @@
 """Dr.Jit gets a libLLVM that is new enough, or an error message of one line says what to do.
 
-Without the error message, Dr.Jit would kill the process.
+Without our check, Dr.Jit would kill the process because of an old libLLVM.
 """
 
 import os

@@ -30,7 +30,7 @@ def direction(cos_theta):
 
 
 def random(n, seed):
-    """Returns a random stream. Its seed is opaque to the compiler, so that all seeds share one kernel."""
+    """Returns a random stream whose seed is opaque to the compiler, so that all seeds share one kernel."""
     return PCG32(n, dr.opaque(dr.auto.UInt64, seed))
 
 

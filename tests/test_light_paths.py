@@ -88,7 +88,10 @@ def test_light_from_below_or_to_below_the_surface_is_black():
 
 
 def scene(integrator):
-    """Loads a scene of a plate, seen from above, under a small lamp near its horizon. The picture is 4 x 4 pixels."""
+    """Loads a scene of a plate, seen from above, that a small lamp lights at a grazing angle.
+
+    The picture has 4 x 4 pixels.
+    """
     look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     return mi.load_dict(
         {
@@ -127,7 +130,8 @@ def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
     found, error = mean("ptracer", 16384)
     assert (error < 0.01 * wanted).all()
     assert (np.abs(found - wanted) < 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
-    # The test detects the difference if the adapter is prepared for the direction of the light, not of the view.
+    # If the adapter is prepared for the direction of the light in place of the view, the colours of the two integrators
+    # differ significantly.
     monkeypatch.setattr(Adapter, "reciprocal", True)
     found, error = mean("ptracer", 16384)
     assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)

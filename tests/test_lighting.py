@@ -50,7 +50,7 @@ def test_the_studio_has_no_small_bright_light_and_a_dark_horizon():
 def test_the_studio_leaves_weaker_fireflies_than_outdoors():
     """Fireflies of a polished ball are five times weaker in the studio than outdoors, at 16 samples per pixel.
 
-    A firefly is the part of a pixel beyond five times its converged value.
+    The firefly in a pixel is the part of its value that exceeds five times its converged value.
     """
     beyond = {}
     for lighting in LIGHTINGS:

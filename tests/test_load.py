@@ -129,9 +129,9 @@ def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
 
 @pytest.mark.parametrize("model", ["nma", "layered"])
 def test_textures_of_eight_bits_are_checked_by_the_values_they_evaluate_to(model, tmp_path):
-    """Byte 20 is accepted, because it evaluates to .078 if the texture is `raw`, and to .007 in linear light otherwise.
+    """A pixel of byte 20 has the value .078 if the texture is `raw`, and .007 in linear light otherwise.
 
-    The adapter accepts `alpha_top` from .001 to .316, so that byte 0 is refused.
+    The adapter accepts `alpha_top` from .001 to .316. So it accepts byte 20 and refuses byte 0.
     """
     Image.fromarray(np.full((4, 4), 20, np.uint8)).save(tmp_path / "grey.png")
     bsdf = material_bsdf(materials.load("wet-nickel"), model)

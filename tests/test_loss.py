@@ -96,7 +96,7 @@ def compound_poisson(rng, mean, quantum, shape):
 
 @pytest.mark.slow
 def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at_their_median():
-    """In bins with few walks, the log loss is least at the median, which is darker than the mean.
+    """In bins with few walks, the log loss is least for a brightness at their median, which is darker than their mean.
 
     The bias of the Huber loss is less than 30 % of the bias of the log loss. The target is matte, and only its
     brightness is fitted.
@@ -202,7 +202,10 @@ def test_albedos_and_their_derivatives_are_unbiased(tables):
 
 
 def assert_mean(values, expected, comparisons):
-    """Asserts the mean of independent values by a t-test. All comparisons share the rate `FALSE_ALARM`."""
+    """Asserts by a t-test that independent values have the mean `expected`.
+
+    All comparisons of a test share the false-alarm rate `FALSE_ALARM`.
+    """
     spread = values.std(ddof=1) / math.sqrt(len(values))
     # The summand 1e-5 allows for rounding in single precision.
     limit = student.isf(0.5 * FALSE_ALARM / comparisons, len(values) - 1)

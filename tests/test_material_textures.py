@@ -126,7 +126,7 @@ def test_an_image_without_colour_channels_is_refused_with_the_names_of_its_chann
 
 
 def test_images_repeat_as_often_as_the_file_says(material_file, tmp_path):
-    """The `uv_scale` of a material applies to every texture without its own `uv_scale`, even if it is added later."""
+    """The `uv_scale` of a material applies to all textures that have no `uv_scale` of their own, old or new."""
     write_image(tmp_path / "image.png", PACKED)
     both = "alpha_bottom = { texture = 'image.png', channel = 'g', uv_scale = 2.5 }\nalbedo = { texture = 'image.png' }"
     path = material_file("alpha_bottom = 0.2", both)

@@ -158,8 +158,7 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_fault(material_file, old
     assert len(str(error.value)) < 1000 and "\n" not in str(error.value)
 
 
-# Values, keys and text fragments that make a material file faulty. The test of faulty files writes them in place of
-# correct keys and values.
+# Values, keys and text fragments that make a material file faulty if they replace correct keys and values.
 NASTY = (
     "0.5",
     "1",
@@ -199,7 +198,7 @@ NASTY += ("[" * 3000, "1" * 400, "1" * 5000, "0x" + "f" * 9000, '"' + "a" * 5000
 
 
 def test_any_file_either_loads_or_is_refused_in_one_line(material_file):
-    """400 random faulty files either load or raise one short line.
+    """400 random faulty files either load or raise an error of one short line.
 
     Each faulty file is a good one with one or two keys or values replaced, and sometimes with a piece cut out.
     """

@@ -24,7 +24,7 @@ from nma.table import Tables
 def at(h, d, p):
     """Returns the directions (light, view) at a position in the grid of a MERL file.
 
-    `h`, `d` and `p` are the indices of theta_h, theta_d and phi_d, and may have fractions.
+    `h`, `d` and `p` are the indices of theta_h, theta_d and phi_d, and need not be integers.
     """
     theta_h, theta_d = (np.asarray(h) / 90) ** 2 * math.pi / 2, np.asarray(d) / 90 * math.pi / 2
     light, view = half_difference.directions(theta_h, theta_d, np.asarray(p) / 180 * math.pi)

@@ -27,7 +27,7 @@ def normals(alpha_x, alpha_y, n=400):
     """Returns normals and their weights. The weighted mean of a function is its integral against D cos(theta).
 
     The slopes of GGX normals follow P(|slope / alpha| > t) = 1 / (1 + t^2). To place many normals in the long tail, the
-    code sets this probability to (1 - v)^4 for uniform numbers v.
+    code sets the probability P to (1 - v)^4 for uniform numbers v.
     """
     v, u2 = square(n)
     t = np.sqrt(1 - (1 - v) ** 4) / (1 - v) ** 2

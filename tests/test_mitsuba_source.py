@@ -224,7 +224,7 @@ def test_a_material_with_azimuths_of_incidence_is_anisotropic(bsdf_file, tmp_pat
 
 
 def changed(fields, **others):
-    """Returns `fields` with the fields of `others` in their place. A field that is None in `others` is left out."""
+    """Returns `fields` with replacements from `others`. A field that is None in `others` is left out."""
     return {name: array for name, array in (fields | others).items() if array is not None}
 
 

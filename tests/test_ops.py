@@ -56,8 +56,8 @@ def test_binary_operations_agree(name):
 
 
 def test_plain_numbers_do_not_capture_arrays():
-    # `nma.ops` must return Python floats for plain numbers. If it returned NumPy scalars, the product of such a scalar
-    # and a Dr.Jit array would be a NumPy array.
+    # `nma.ops` must return Python floats for plain numbers, not NumPy scalars. The product of a NumPy scalar and a
+    # Dr.Jit array is a NumPy array.
     x = dr.llvm.Float([1.0, 2.0])
     assert type(ops.sqrt(4.0) * x) is dr.llvm.Float
     assert type(ops.select(2.0 > 1.0, 3.0, 4.0) * x) is dr.llvm.Float

@@ -28,7 +28,7 @@ def column(vectors, name, channel=0):
 
 
 def metal_of(vectors):
-    """Returns the index of each vector's conductor in the list of conductors, -1 if it is not in the list."""
+    """Returns the index of each vector's conductor in the list of conductors, or -1 for an unlisted conductor."""
     metals = load_conductors()
     corpus = np.hstack([metals.eta, metals.k])
     conductors = np.hstack(
@@ -71,7 +71,7 @@ def test_every_parameter_follows_its_law(population):
 def test_conductors_of_the_range_are_uniform(population):
     """In the population `range`, the values of eta and k of the conductors are uniform over their ranges.
 
-    In the population `mixed`, this is true of all conductors that are no real metals.
+    In the population `mixed`, eta and k of all conductors that are no real metals are uniform too.
     """
     vectors = draw(population)
     vectors = vectors[metal_of(vectors) < 0]
@@ -131,7 +131,7 @@ def test_a_third_of_the_unseen_metals_is_held_out():
 
 @pytest.mark.parametrize("population", POPULATIONS)
 def test_draws_lie_in_the_training_range(population):
-    """All draws lie in the training range, including real metals, and the training range lies in the valid range."""
+    """All drawn materials, even real metals, lie in the training range. The training range lies in the valid range."""
     vectors = draw(population)
     np.testing.assert_array_equal(LAYERED3.check(vectors, "training"), vectors)
     np.testing.assert_array_equal(LAYERED3.check(vectors), vectors)

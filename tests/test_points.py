@@ -42,8 +42,8 @@ def pool_of(source, **sizes):
 def test_weighted_points_are_uniform_over_the_hemisphere():
     """For every wi, the weighted mean of a function over the points is its mean over the hemisphere of wo.
 
-    More points lie near peaks than elsewhere, and their weights are smaller. A failure means that fits are biased
-    towards some directions.
+    The points near peaks are denser than elsewhere, so that they have smaller weights. A failure means that fits are
+    biased towards some directions.
     """
     pool = pool_of(LAMBERT)
     z, x = pool.wo[2], pool.wo[0]

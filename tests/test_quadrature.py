@@ -1,8 +1,8 @@
 """Points inside the bins of a table: weighted means of known functions, and of lobes far narrower than a bin.
 
-An estimate is repeated with independent random shifts of its lattice. Student's t-test compares the mean of the
-estimates with the known value. A test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by Sidak's
-correction. All seeds are fixed.
+An estimate is repeated with independent random shifts of its lattice of points. Student's t-test compares the mean of
+the estimates with the known value. A test has the false-alarm rate `FALSE_ALARM`, divided among its comparisons by
+Sidak's correction. All seeds are fixed.
 """
 
 import math
@@ -83,7 +83,7 @@ def azimuth_away(points):
 
 @pytest.mark.parametrize("law", (crowded, uniform))
 def test_means_of_smooth_functions_are_exact(law):
-    """The weights have mean 1, and weighted moments of cosines and azimuth are those of uniform points."""
+    """The weights of points have mean 1, and weighted moments of cosines and azimuth are those of uniform points."""
     points = law(BINS, 2048, 1)
     i, o, p = BINS.T
     width, step = 1.0 / 40, math.pi / 40
@@ -114,7 +114,7 @@ def test_points_lie_in_their_bins(law, dtype):
     rng = np.random.default_rng(3)
     below_one = np.nextafter(dtype(1), dtype(0))
     corners = [np.full((3, len(i)), u, dtype) for u in (0.0, below_one)]
-    # `bin_points` keeps the cosines of both directions 1e-6 above the horizon. To move one cosine up may move the other
+    # `bin_points` keeps the cosines of both directions above 1e-6. This correction of one cosine may move the other
     # cosine out of its bin by 1e-6.
     slack = 1e-6 + 4 * np.finfo(dtype).eps
     for u in (*corners, rng.random((3, len(i)), dtype), rng.integers(0, 2, (3, len(i))) * below_one):
@@ -220,12 +220,12 @@ def test_means_of_a_lobe_of_alpha_001_are_exact(lobe_means):
     points = crowded(np.array(LOBE_BINS, np.float64), 1 << 13, 6)
     estimates = (points.weight * lobe(points.wi, points.wo, 0.001)).mean(axis=0)
     assert_means(estimates / lobe_means, 1.0)
-    # The estimates must also be precise. Otherwise the comparison of means would not detect errors.
+    # The estimates must also be precise, because a comparison of imprecise means would not detect errors.
     assert (estimates.std(axis=0, ddof=1) / math.sqrt(REPEATS) < 0.01 * lobe_means).all()
 
 
 def test_a_few_crowded_points_see_what_uniform_points_miss(lobe_means):
-    """From 20 points, estimates of the mirror bin's mean vary over 3 times as much with uniform points as with ours."""
+    """With 20 points, estimates of the mirror bin's mean vary far more for uniform points than for `bin_points`."""
     mirror = np.array(LOBE_BINS[:1], np.float64)
     spread = []
     for law in (crowded, uniform):
@@ -253,7 +253,7 @@ def test_other_grids_work_too():
 
 
 def test_lattice_points_are_well_spread():
-    """Each of 512 cells of the cube has about an equal share of 4096 points."""
+    """Each of 512 cells of the unit cube has about an equal share of 4096 points."""
     points = lattice_points(4096)
     assert points.shape == (4096, 3)
     cells = np.bincount((points * 8).astype(int) @ [64, 8, 1], minlength=512)

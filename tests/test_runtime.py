@@ -152,13 +152,13 @@ def test_an_adapter_evaluates_like_the_package():
     for instruction_set in in_single_precision():
         loaded = Runtime("layered3-3x32", instruction_set)
         found = np.column_stack(loaded.eval_pdf(loaded.prepare(params, wi.T[2]), wi, wo))
-        # Narrow lobes multiply the errors of the network's outputs, which are 1e-5.
+        # Narrow lobes multiply the errors of the network's outputs, which are about 1e-5.
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("hidden", ([32, 32, 32], [8]))
 def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hidden):
-    """The values of a measured material agree within 2e-3.
+    """The runtime and the package compute the same values of a measured material, within 2e-3.
 
     The class has no parameters, so that cos(theta_i) is the only input of the network. Lobes are stretched in the plane
     of incidence, flattened and faded.

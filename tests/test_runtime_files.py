@@ -124,7 +124,10 @@ def test_inconsistent_files_are_refused(tmp_path, data, message):
 
 @pytest.mark.usefixtures("compiler")
 def test_a_folder_is_no_weights_file(tmp_path):
-    """A folder is refused with an `nma::Error`, although it can be opened like a file and only reading it fails."""
+    """A folder in place of a file is refused with an `nma::Error`.
+
+    A folder can be opened like a file, and only reading from it fails.
+    """
     with pytest.raises(
         WeightsError, match=re.escape(f"{tmp_path}: no such weights file, or it cannot be read")
     ):
@@ -180,7 +183,7 @@ def test_unusual_but_valid_files_load(tmp_path):
 
 @pytest.mark.usefixtures("compiler")
 def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
-    """The runtime accepts the recorded parameters up to rounding, also beyond the training range, and no others.
+    """The runtime accepts only the parameters in the adapter's record, up to rounding, even beyond the training range.
 
     `nma.adapter.Adapter.check` in the package accepts and refuses the same parameters.
     """

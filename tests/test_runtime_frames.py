@@ -43,7 +43,7 @@ def directions():
 
 
 def prepared(runtime, way, wi):
-    """Returns the BRDFs seen from `wi`, which the C interface prepares in the given way."""
+    """Returns the BRDFs seen from `wi`, which the C interface prepares in the way named by `way`."""
     brdfs = runtime.prepare(np.zeros((CASES, 0), np.float32), wi)
     if way == "batch":
         return brdfs

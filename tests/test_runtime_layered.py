@@ -24,7 +24,7 @@ CASES = {
     "thick": {"alpha_top": 0.15, "alpha_bottom": 1.0, "eta_top": 1.3, "sigma_t": 3.0},
     "index_matched": {"alpha_top": 0.2, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 0.3},
 }
-# The lobes of this material are too narrow for the bins of a chi-square test, so that only mean values are tested.
+# A material whose lobes are too narrow for the bins of a chi-square test, so that only its mean values are tested.
 NARROW = {"alpha_top": 0.002, "alpha_bottom": 0.02, "eta_top": 1.5, "sigma_t": 0.5}
 COSINES = (1.0, 0.6, 0.1)
 ESTIMATORS = pytest.mark.parametrize("estimator", ["walk", "estimate"])
@@ -40,8 +40,8 @@ def view(mu):
 
 @pytest.fixture(scope="module")
 def bridge(compiler, tmp_path_factory):
-    # Dr.Jit does not fuse products and sums. The flag -ffp-contract=off forbids the compiler to fuse them, so that C++
-    # and Dr.Jit round equally.
+    # Dr.Jit does not fuse products and sums. With -ffp-contract=off, the compiler does not fuse products and sums
+    # either, so that C++ and Dr.Jit round equally.
     library = built(compiler, "layered_bridge.cpp", tmp_path_factory.mktemp("layered"), "-ffp-contract=off")
 
     def call(name, inputs, shape):
@@ -103,10 +103,10 @@ def beside_the_mirror(rng, wi, params):
 
 
 def test_density_is_that_of_the_package_case_by_case(bridge):
-    """The density in C++ equals that of the package within 1e-4, for 4,000 materials and pairs of directions.
+    """C++ and the package compute the same density within 1e-4, for 4,000 materials and pairs of directions.
 
-    C++ and the package compute in single precision and round in the same way. So their densities agree better with each
-    other than with the exact density. For example, an index-matched coat reflects light only because of rounding.
+    C++ and the package compute in single precision and round in the same way, so that their densities agree better with
+    each other than with the exact density. For example, an index-matched coat reflects light only because of rounding.
     """
     rng, n = np.random.default_rng(0), 4000
     params, wi, wo = random_materials(rng, n), random_views(rng, n), random_views(rng, n)

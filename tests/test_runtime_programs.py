@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 RUNTIME = ROOT / "runtime"
 WEIGHTS = [ROOT / f"nma/adapter/trained/{name}.safetensors" for name in ("layered3-5x64", "layered3-3x32")]
 STRICT = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-pthread", f"-I{RUNTIME}"]
-# Only `make test-all` runs the tests with clang++. It also runs most of the other tests in this file.
+# Only `make test-all` runs the tests with clang++ and most of the other tests in this file.
 COMPILERS = ["g++", pytest.param("clang++", marks=pytest.mark.slow)]
 ARM, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64-static"
 

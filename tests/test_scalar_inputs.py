@@ -165,7 +165,7 @@ end_header
 
 @pytest.mark.parametrize("kind", ["nma", "layered"])
 def test_attributes_of_a_mesh_are_clamped_to_the_range(kind, tmp_path):
-    """Vertex colours beyond the range render like the constant 1, alone and inside a checkerboard.
+    """Vertex colours above the range of a parameter render like the constant 1, alone and inside a checkerboard.
 
     Vertex colours cannot be checked when the BSDF is loaded, because only the mesh has their values.
     """
@@ -219,7 +219,7 @@ COLOUR = {"type": "rgb", "value": [0.1, 0.5, 0.9]}
 
 
 def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
-    """Each wrong input is refused by a message with its name, and each correct one loads.
+    """A wrong input is refused with an error message that names the input, and a correct input is accepted.
 
     The sRGB byte 128 is .2158605 in linear light (IEC 61966-2-1), and 128 / 255 if the texture is `raw`.
     """

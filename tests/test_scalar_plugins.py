@@ -113,7 +113,8 @@ def test_composites_are_linear_combinations_of_their_parts():
     """
     layered, nma, diffuse = {"type": "layered", **MATERIAL}, {"type": "nma", **MATERIAL}, {"type": "diffuse"}
     flat = {"type": "normalmap", "normalmap": {"type": "srgb", "color": [0.5, 0.5, 1.0]}}
-    # Each composite, with the weights of four pictures in its picture: of layered, of nma, of diffuse, and of the sky.
+    # Each composite has four weights. The picture of the composite is the sum of four pictures with these weights: of
+    # layered, of nma, of diffuse, and of the sky.
     composites = {
         "blend": (blend(0.3, layered, diffuse), (0.7, 0, 0.3, 0)),
         "mask": (mask(0.6, layered), (0.6, 0, 0, 0.4)),

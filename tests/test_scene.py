@@ -195,7 +195,7 @@ def test_textures_depend_on_the_seed_alone(textures):
 
 
 def test_textures_tile(textures):
-    """Pixels on opposite borders of a texture differ at most 1.5 times as much as neighbouring pixels inside it."""
+    """Pixels on opposite borders of a texture differ at most 1.5 times as much as neighbouring pixels in the middle."""
     for texture in textures.values():
         for axis in (0, 1):
             inside = np.abs(np.diff(texture, axis=axis)).mean(axis=1 - axis)
@@ -232,7 +232,7 @@ def test_measure_wants_different_seeds(seeds):
 
 
 def test_ztest_false_alarms_are_as_stated():
-    """Of 400 pairs of images with equal means, the Z-test at a false-alarm rate of 5 % rejects about 20.
+    """At a false-alarm rate of 5 %, the Z-test rejects about 20 of 400 pairs of images with equal means.
 
     With fresh seeds, 6 to 38 pairs are rejected in 99.98 % of all runs.
     """

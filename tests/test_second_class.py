@@ -1,6 +1,6 @@
 """To add a class of materials, the code needs only one file and one line in a registry.
 
-The file contains the parameters of the class and its source. The tests follow docs/how-it-is-built.md.
+The new file contains the parameters of the class and its source. The tests use the example of docs/how-it-is-built.md.
 """
 
 import sys
@@ -43,7 +43,10 @@ MATERIAL = 'title = "Steel"\ndescription = "Bare."\nclass = "bare"\n[parameters]
 
 @pytest.fixture
 def bare(monkeypatch, tmp_path):
-    """The path of a material file of the class `bare`, whose file and line this fixture adds."""
+    """The path of a material file of the class `bare`.
+
+    The fixture adds the file of the class and its line in the registry.
+    """
     folder = tmp_path / "sources"
     folder.mkdir()
     (folder / "bare.py").write_text(FILE)

@@ -50,7 +50,7 @@ class Scatter:
 
 
 class Lambert(Scatter):
-    """f = rho / pi, with wo drawn in proportion to cos(theta_o)."""
+    """A source with f = rho / pi. The density of wo is proportional to cos(theta_o)."""
 
     def draw(self, wi, u1, u2):
         phi, r = 2.0 * math.pi * u1, ops.safe_sqrt(u2)
@@ -58,7 +58,7 @@ class Lambert(Scatter):
 
 
 class Lopsided(Scatter):
-    """f cos(theta_o) = rho mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi), with wo drawn uniformly."""
+    """A source with f cos(theta_o) = rho mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi) and uniform wo."""
 
     def draw(self, wi, u1, u2):
         phi, r = 2.0 * math.pi * u1, ops.safe_sqrt(1.0 - u2 * u2)
@@ -68,7 +68,7 @@ class Lopsided(Scatter):
 
 
 class Retro(Scatter):
-    """f cos(theta_o) = rho mu_i (1 + cos(phi_o - phi_i)) / (4 pi): a retro-reflector."""
+    """A retro-reflecting source with f cos(theta_o) = rho mu_i (1 + cos(phi_o - phi_i)) / (4 pi)."""
 
     def draw(self, wi, u1, u2):
         phi, r = 2.0 * math.pi * u1, ops.safe_sqrt(1.0 - u2 * u2)
@@ -106,7 +106,10 @@ def test_bins_of_a_lambertian_surface_are_normalised():
 
 
 def test_bins_know_theta_i_and_azimuth():
-    """phi is the folded azimuth between wi and wo: the first bin is retro-reflection, the last the mirror direction."""
+    """phi is the folded azimuth between wi and wo.
+
+    The first bin of phi contains retro-reflection, and the last bin contains the mirror direction.
+    """
     edges = np.linspace(0.0, math.pi, 7)
     azimuth = 1.0 + np.diff(np.sin(edges)) / np.diff(edges)
     expected = 0.8 / (4.0 * math.pi) * middles(4)[:, None, None] * azimuth
@@ -281,7 +284,7 @@ def test_saved_tables_come_back(tables, tmp_path):
 def test_one_number_of_walks_and_half_precision_are_enough(tables, tmp_path):
     """A reference file may have one count of walks for all materials, and values in half precision (CONVENTIONS.md).
 
-    Other programs may write such files.
+    Other programs may write reference files in this form.
     """
     path = tmp_path / "theirs.npz"
     np.savez(path, params=tables.params, table=tables.values.astype(np.float16), walks=819_200)

@@ -38,7 +38,7 @@ def ggx(alpha):
 
 
 def lopsided(wi, wo):
-    """Returns f cos(theta_o) = mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi), for test purposes."""
+    """Returns a test function f cos(theta_o) = mu_i mu_o (2 + cos phi_i) (2 + sin phi_o) / (18 pi)."""
     sin_i, sin_o = (ops.maximum(ops.safe_sqrt(1.0 - w.z * w.z), 1e-6) for w in (wi, wo))
     return Color.of(wi.z * wo.z * (2.0 + wi.x / sin_i) * (2.0 + wo.y / sin_o) * (1.0 / (18.0 * math.pi)))
 
@@ -58,8 +58,8 @@ def test_bins_of_a_lambertian_surface_hold_their_means(grid):
 def assert_close(tables, expected, grid):
     """Asserts that the bins of a table hold the means of a linear function.
 
-    Bins near the mirror direction must be within their stated errors. All other bins must be almost exact, because
-    their points are evenly spread.
+    Bins near the mirror direction must be within their stated errors. Bins away from the mirror direction must be
+    almost exact, because their points are evenly spread.
     """
     near = values._near_mirror(np.arange(grid.bins), grid).reshape(grid.shape[:-1])
     found, error = tables.values[0], tables.error[0]
@@ -75,7 +75,10 @@ def assert_as_stated(found, expected, error):
 
 
 def test_bins_know_theta_i_and_azimuth():
-    """phi is the folded azimuth between wi and wo: the first bin is retro-reflection, the last the mirror direction."""
+    """phi is the folded azimuth between wi and wo.
+
+    The first bin of phi contains retro-reflection, and the last bin contains the mirror direction.
+    """
 
     def retro(wi, wo):
         sines = ops.maximum(ops.safe_sqrt(1.0 - wi.z * wi.z) * ops.safe_sqrt(1.0 - wo.z * wo.z), 1e-6)
@@ -250,7 +253,7 @@ def test_a_material_that_a_table_does_not_have_is_refused():
 
 @pytest.mark.slow
 def test_a_material_survives_a_merl_file():
-    """A BSDF of the renderer, sampled at MERL's resolution, gives almost the same table as the BSDF itself."""
+    """A BSDF that is stored as a MERL file, with the format's limited resolution, has almost the same table."""
     direct, through = (tabulate_values(source, points=64) for source in (ggx(0.1), Merl.of(ggx(0.1))))
     figures = metrics.table_metrics(through.values[0], direct.values[0], direct.error[0])
     assert figures["log_loss"] < 3e-4
@@ -266,7 +269,7 @@ FOUR = np.array(
 
 @pytest.mark.parametrize("crowded", (True, False))
 def test_points_of_anisotropic_bins_have_no_preference(crowded):
-    """The weights have mean 1, and weighted moments of all four angles are those of uniform points."""
+    """The weights of points have mean 1, and weighted moments of all four angles are those of uniform points."""
     grid = Grid(6, 8, 12, phi_i=10)
     bins = np.minimum(FOUR, [5, 9, 7, 11])
     i, a, o, b = bins.T
@@ -290,7 +293,7 @@ def test_points_of_anisotropic_bins_have_no_preference(crowded):
 
 
 def test_crowded_points_of_anisotropic_bins_have_the_mean_of_even_ones():
-    """Over two mirror bins, the mean of a lobe of alpha .05 is the same with our points as with many uniform points."""
+    """Over two mirror bins, points near the mirror direction give the same mean of a lobe as more uniform points."""
     grid, bins = Grid(6, 6, 12, phi_i=12), FOUR[[0, 3]]
     i, a, o, b = bins.T
     means = []

@@ -80,10 +80,10 @@ def test_eval_equals_mitsuba_principled():
 
     Half of the directions are sampled from the lobes. A failure means that our formulas differ from Mitsuba's. Mitsuba
     computes in single precision, so that the test allows larger differences in two cases:
-    - The clearcoat is divided by the sum 1 + (alpha^2 - 1) cos^2(theta_h). The relative error of the clearcoat may be
-      a few rounding errors, divided by this sum.
+    - The clearcoat is divided by the sum 1 + (alpha^2 - 1) cos^2(theta_h), so that the relative error of the clearcoat
+      may be a few rounding errors divided by this sum.
     - If both directions are grazing, and opposite within a hundredth, the cosine between direction and half vector
-      loses digits. The allowed relative difference is 2e-3.
+      loses digits, so that a relative difference of 2e-3 is allowed.
 
     Directions whose cosine is below .001 are not compared. Near the horizon, Mitsuba's cosine between direction and
     half vector may become negative by rounding, and Mitsuba returns zero.
@@ -91,7 +91,7 @@ def test_eval_equals_mitsuba_principled():
     rng = np.random.default_rng(11)
     n = 10_000
     p = to_single(random_principled(rng, n))
-    # A tenth of the sets have alpha at its lower bound of .001, and a tenth have a smaller alpha.
+    # A tenth of the parameter sets have alpha at its lower bound of .001, and a tenth have a smaller alpha.
     floor = rng.random(n)
     rough = np.where(floor < 0.1, np.sqrt(np.float32(0.001)), np.where(floor > 0.9, 0.01, p.roughness))
     p = p._replace(roughness=rough.astype(np.float32).astype(np.float64))
@@ -214,7 +214,7 @@ def test_ten_million_evaluations_are_finite_and_not_negative():
     for x in results:
         assert dr.all(dr.isfinite(x) & (x >= 0.0))
     assert all(dr.all(dr.isfinite(Float(x))) for x in sampled)
-    # Every direction that reflects light can be sampled.
+    # Every direction wo with a value above 0 has a pdf above 0.
     assert dr.all((pdf > 0) | (value.x + value.y + value.z == 0))
 
 

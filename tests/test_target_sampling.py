@@ -67,7 +67,7 @@ class Cases:
     def __init__(self, seed, n=N_BLENDS, dialect=True):
         rng = np.random.default_rng(seed)
         blend = random_blend(rng, n, 5, dialect)
-        # Only the first instances, 1 to 5 at random, have a weight.
+        # A random count of instances, from 1 to 5, have a weight above 0.
         used = np.arange(5)[:, None] < rng.integers(1, 6, n)
         weights = np.where(used, stacked(blend.weights) + 1e-3, 0.0)
         self.blend = Blend(blend.instances, tuple(weights / weights.sum(0)))
@@ -97,7 +97,10 @@ def drawn(cases, count, seed, sampler):
 
 
 def draw(cases, count, seed, alpha_scale=1.0):
-    """Draws samples of the blends. `alpha_scale` multiplies the widths of specular lobes, to make samples wrong."""
+    """Draws samples of the blends.
+
+    An `alpha_scale` other than 1 makes the samples wrong, because it multiplies the widths of specular lobes.
+    """
 
     def sampler(blend, wi, lane, u):
         rough = float(np.sqrt(alpha_scale))
@@ -205,7 +208,7 @@ def integrate_adaptively(cases, boxes, tolerance=2e-6):
             return total.reshape(n, 2**DEPTH, -1).sum(2)
         parts, whole = parts[~done].reshape(-1, 4), quarters[~done].ravel()
         owner = np.repeat(owner[~done], 4)
-    raise AssertionError("The density does not integrate: it has a singularity.")
+    raise AssertionError("the integral of the density does not converge; the density has a singularity")
 
 
 @pytest.fixture(scope="module")

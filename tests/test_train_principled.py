@@ -117,7 +117,7 @@ def lanes(w: Vec3) -> Vec3:
 def instances() -> list[Principled]:
     """Returns random BRDFs, and BRDFs with `specular` near the ends of its range.
 
-    Near the ends, the export may write the parameter `eta` in place of `specular`.
+    Near an end of the range of `specular`, the export may write the parameter `eta` instead.
     """
     many = random_principled(np.random.default_rng(4), 8)
     one = [

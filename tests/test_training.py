@@ -33,7 +33,7 @@ QUICK = replace(SINGLE, network="1x16", rows=32, bins_per_row=8, points=32, step
 
 @pytest.fixture(scope="module", autouse=True)
 def fast_compile():
-    """Compiles with fewer optimisations, because compiling takes longer than these short runs."""
+    """Compiles the training steps with fewer optimisations, because compiling takes longer than a short run."""
     with pytest.MonkeyPatch.context() as patch:
         steps = jax.jit(loop._group.__wrapped__, static_argnames=("recipe", "objective"), **FAST_COMPILE)
         patch.setattr(loop, "_group", steps)
@@ -154,8 +154,8 @@ def test_the_paper_s_preset_runs(tables):
     assert run.step == 4
     assert np.isfinite(run.losses).all()
     assert run.losses == run.log_losses
-    # The adapter's network has 14 inputs, three hidden layers of 32 neurons, and 23 outputs. The paper's library has
-    # 33 inputs. Its 7159 parameters include 100 codes of 32 numbers.
+    # The adapter's network has 14 inputs, three hidden layers of 32 neurons, and 23 outputs. The paper's network has
+    # 33 inputs. The 7159 parameters of the paper's library include 100 codes of 32 numbers.
     assert network.parameters(adapter.layers) == 7159 - 3200 - 19 * 32
 
 

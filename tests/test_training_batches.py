@@ -67,7 +67,7 @@ def test_a_batch_holds_the_values_of_the_tables(tables):
     )
     assert ((batch.mu * 40 >= batch.i - 1e-5) & (batch.mu * 40 <= batch.i + 1 + 1e-5)).all()
     assert ((batch.shift >= 0) & (batch.shift < 1)).all()
-    # The quantum is the contribution of one walk of throughput 1 to a bin. By eq. 9 of the paper, it is
+    # The quantum is the contribution of one walk of throughput 1 to a bin. By eq. 9 of the paper, the quantum is
     # 1 / (walks per row x solid angle of a bin).
     np.testing.assert_allclose(batch.quantum, 1.0 / (819_200 / 40 * ISOTROPIC.solid_angle), rtol=1e-6)
     assert all(x.dtype == np.float32 for x in batch)

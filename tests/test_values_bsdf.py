@@ -31,7 +31,7 @@ def interactions(n, cos_theta):
 
 @pytest.mark.parametrize("cos_theta", (0.2, 0.9))
 def test_values_are_the_source_s_and_sampling_is_unbiased(file, cos_theta):
-    """The values are those of the source, and the mean sample weight is the source's albedo, within 2 %.
+    """The BSDF has the values of its source, and the mean sample weight is the source's albedo, within 2 %.
 
     The integral of the pdf is the share of valid samples, within 3 %. A failure means biased pictures. Seeds are fixed.
     """

@@ -1,4 +1,4 @@
-"""The random walk of the layered source, compared with results that are known without it.
+"""The random walk of the layered source, compared with results that are known without random walks.
 
 Statistical tests compare the mean of walks with the known value by a Z-test. A test has the false-alarm rate
 `FALSE_ALARM`, divided among its comparisons by Sidak's correction. Seeds are fixed, so a passing test keeps passing.
@@ -157,7 +157,7 @@ def test_isotropic_slab_over_black():
 
 
 def test_rough_coat_over_white_conductor():
-    """The albedo of this material is .556, to three digits.
+    """The albedo of a rough coat over a white conductor is .556, to three digits.
 
     In two public programs, evaluation and random walks give different albedos for this material.
     """

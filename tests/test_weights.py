@@ -1,4 +1,4 @@
-"""Weights files: an adapter is the same after saving and loading, and a faulty file is refused in one line."""
+"""Weights files: an adapter is the same after saving and loading, and a faulty file raises an error of one line."""
 
 import json
 import re
@@ -64,7 +64,7 @@ def test_an_adapter_is_the_same_after_saving_and_loading(tmp_path, name, variant
 
 
 def test_stretched_targets_must_depend_on_the_direction(tmp_path):
-    """A file with a stretched target that does not depend on the direction is refused.
+    """A weights file is refused if its target has stretched lobes, but its network does not depend on the direction.
 
     Lobes are stretched in the plane of incidence, which depends on the direction.
     """
