@@ -272,7 +272,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
             {"adapter": one, "sigma_t": 0.6},
             "was trained for a single material, whose sigma_t is 0.5, not 0.6",
         ),
-        ({"adapter": one, "sigma_t": bitmap(0.5)}, "so that no texture can drive sigma_t"),
+        ({"adapter": one, "sigma_t": bitmap(0.5)}, "so sigma_t cannot be textured"),
         (
             {"eta_top": png(tmp_path, False)},
             "the texture of eta_top at x=0, y=0, the first of 4 such pixels: eta_top is 0.21586",

@@ -106,7 +106,7 @@ def test_the_bsdf_needs_no_parameters_and_accepts_the_recorded_ones(weights, giv
             {"albedo": {"type": "rgb", "value": [0.1, 0.2, 0.3]}},
             "whose albedo is 0.95, 0.08, 0.03, not 0.1, 0.2, 0.3",
         ),
-        ({"sigma_t": bitmap_texture(np.full((2, 2), 0.6))}, "no texture can drive sigma_t"),
+        ({"sigma_t": bitmap_texture(np.full((2, 2), 0.6))}, "sigma_t cannot be textured"),
         ({"sigma_t": 0.5, "clamp": True}, "whose sigma_t is 0.6, not 0.5"),
     ],
 )

@@ -1,12 +1,12 @@
-"""Rendering in Mitsuba 3. Importing this package registers its BSDF plugins `nma` and `layered`:
+"""Rendering in Mitsuba 3. Importing this package registers its BSDF plugins `nma`, `layered` and `values`:
 
     import mitsuba as mi
     import nma.render
 
     mi.set_variant("llvm_ad_rgb")
 
-The plugins are registered in the variant in use and in every variant chosen later, so these lines may stand in any
-order.
+The plugins are registered in the current variant and in every variant that is set later, so `nma.render` may be
+imported before or after `mi.set_variant`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from nma.render import register as _plugins
 
 __all__ = ["use"]
 
-# Mitsuba loads Dr.Jit, and Dr.Jit then looks for libLLVM, so choose libLLVM first. Without libLLVM, scalar_rgb and the
-# CUDA variants still work.
+# Mitsuba loads Dr.Jit, which then looks for libLLVM, so libLLVM must be chosen first. Without libLLVM, scalar_rgb and
+# the CUDA variants still work.
 with contextlib.suppress(MissingDependencyError):
     ensure_llvm()
 _plugins.register()
@@ -31,13 +31,14 @@ def use(variant: str = "auto") -> str:
     """Choose Mitsuba's variant and return its name.
 
     Args:
-        variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb. The
-            plugins for scalar_rgb are compiled when scalar_rgb is first chosen. Our BSDFs run in these three variants.
+        variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb. This
+            package's BSDFs run in llvm_ad_rgb, cuda_ad_rgb and scalar_rgb. The plugins for scalar_rgb are compiled when
+            scalar_rgb is first chosen.
 
     Raises:
         ParamError: Mitsuba has no such variant.
-        MissingDependencyError: the variant needs libLLVM, a C++ compiler or an NVIDIA GPU, and this machine has none,
-            or its libLLVM is too old.
+        MissingDependencyError: the variant needs an NVIDIA GPU, a C++ compiler or libLLVM that this machine does not
+            have, or libLLVM is too old.
     """
     import drjit as dr
     import mitsuba as mi

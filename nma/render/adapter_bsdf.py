@@ -1,13 +1,14 @@
 """Mitsuba 3 BSDF `nma`: a source material, evaluated by its adapter as a blend of Principled BRDFs.
 
-The network maps source parameters and cos(theta_i) to the blend, which gives value, density and samples. Without
-textures the network runs once, when the scene is loaded, and fills curves over cos(theta_i). With textures, and for
-anisotropic adapters, it runs once per shading point. Inputs: `nma.render.inputs`. The BSDF is one-sided; wrap it in
-`twosided` if needed.
+The network maps source parameters and cos(theta_i) to the parameters of the blend, which is then evaluated and sampled.
+Without textures the network runs only when the scene is loaded, and the blend's parameters are stored as curves over
+cos(theta_i). With textures, and for anisotropic adapters, the network runs once per shading point. `nma.render.inputs`
+reads the source parameters. The BSDF is one-sided; wrap it in `twosided` if needed.
 
-Properties: `adapter`, the name of a shipped adapter or a weights file; `clamp`, whether inputs beyond the adapter's
-training range are moved to its bounds instead of refused; and the parameters of the adapter's class, or a `material`
-that has them. An adapter of a single material needs no parameters, and refuses the parameters of another material.
+The property `adapter` is the name of a shipped adapter or a weights file. With `clamp`, parameters outside the
+adapter's training range are clamped to that range instead of refused. Further properties are the parameters of the
+adapter's class, or a `material` that has them. An adapter of a single material needs no parameters, and refuses the
+parameters of another material.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def define() -> type:
         def parameters_changed(self, keys: Any = ()) -> None:
             try:
                 super().parameters_changed(keys)
-            finally:  # refused edits were undone, but other parameters may have changed
+            finally:  # bad edits were undone, but other parameters may have changed
                 if self._curves is not None:
                     self._curves.update(self.inputs.columns())
 
@@ -92,9 +93,9 @@ def define() -> type:
             return ctx.mode == mi.TransportMode.Importance and not self.adapter.reciprocal
 
         def _towards_camera(self, si, wo, active) -> Color:
-            """f cos(theta_o) of light that arrives along `si.wi` and goes on to the camera along `wo`.
+            """f cos(theta_o) for light that arrives from `si.wi` and leaves towards the camera along `wo`.
 
-            The view direction is then `wo`, so the BRDF is prepared for `wo`. Paths from the light thus get the same
+            Here the view direction is `wo`, so the BRDF is prepared for `wo`. Paths from the light thus get the same
             values as paths from the camera, although the BRDF is not reciprocal. Samples are still drawn for `si.wi`.
             """
             turned = mi.SurfaceInteraction3f(si)
@@ -112,7 +113,8 @@ def define() -> type:
             return mean_of_samples(draw, ALBEDO_POINTS, front)
 
         def _make_curves(self) -> Curves | None:
-            """The curves that replace the network; None if more than cos(theta_i) varies, and the network must run."""
+            """The curves over cos(theta_i) that replace the network; None if the blend also depends on the point or the
+            azimuth."""
             if self.inputs.textured or self.adapter.anisotropic:
                 return None
             return Curves(self.adapter, self.inputs.columns())
@@ -141,7 +143,8 @@ def define() -> type:
 
 
 def load_once(name_or_path: str) -> Adapter:
-    """The adapter of a name or a weights file. BSDFs of the same file share it while the file does not change."""
+    """Loads an adapter by its name or weights file. BSDFs of the same file share the adapter while the file does not
+    change."""
     path = weights_file(name_or_path)
     stat = Path(path).stat() if Path(path).is_file() else None
     return _loaded(name_or_path, (stat.st_mtime_ns, stat.st_size) if stat else None)

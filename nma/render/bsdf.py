@@ -9,7 +9,7 @@ from typing import Any
 from nma.lattice import lattice_steps
 from nma.ops import Color, Vec3, minimum, select
 
-# The Mitsuba variants in which our Python BSDFs run: their parameters are RGB, and their code is vectorised.
+# The Mitsuba variants in which our Python BSDFs run. Other variants lack RGB colours or vectorised code.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 # Mitsuba's BSDFs that call one nested BSDF and return its result.
 _HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
@@ -19,9 +19,10 @@ def define_base() -> type:
     """The base class of all our BSDFs, for Mitsuba's current variant.
 
     A subclass defines `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`),
-    `mi.traverse` and attributes show them, and `differentiable` says whether derivatives reach them. A subclass calls
-    this `__init__` last, after everything that can fail. From then on the BSDF is registered in Dr.Jit, which calls it
-    in all scenes until it is destroyed. A traceback could keep a BSDF alive whose `__init__` failed.
+    `mi.traverse` and attributes list these inputs, and `differentiable` says whether the inputs have derivatives. A
+    subclass calls this `__init__` last, after everything that can fail, because this `__init__` registers the BSDF in
+    Dr.Jit. Dr.Jit calls a registered BSDF in all scenes until the BSDF is destroyed, and a traceback could keep a BSDF
+    alive whose `__init__` failed later.
     """
     import mitsuba
 
@@ -38,8 +39,8 @@ def define_base() -> type:
             self.serial = next(_serials)
 
         def _declare(self, *flags: mi.BSDFFlags) -> None:
-            """Declares one component: glossy reflection on the front, with `flags`, and with the flag for textures if
-            needed."""
+            """Declares one component: glossy reflection on the front, with further `flags`, and with the flag of
+            textures if there are textures."""
             both = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             if self.inputs is not None and self.inputs.textured:
                 both |= mi.BSDFFlags.SpatiallyVarying
@@ -92,14 +93,14 @@ def define_base() -> type:
             return self.inputs.values if self.inputs is not None else ()
 
         def _front(self, ctx, si, active):
-            """Which lanes see the front of the surface; none if the context disables our lobe."""
+            """A mask of the lanes that see the front of the surface; False if the context disables the glossy lobe."""
             if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 return mi.Bool(False)
             return mi.Bool(active) & (si.wi.z > 0)
 
         def _sampled(self, wo: Vec3, pdf, weight: Color, active):
-            """The return value of `sample`: direction, density, and value over density. The last two are 0 for invalid
-            samples."""
+            """The return value of `sample`: direction, density, and value divided by density. Density and value are 0
+            for invalid samples."""
             valid = active & (pdf > 0)
             bs = dr.zeros(mi.BSDFSample3f)
             bs.wo = mi.Vector3f(*wo)
@@ -113,9 +114,9 @@ def define_base() -> type:
 
 
 def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, active: Any = True) -> Color:
-    """The mean of draw(k, u1, u2, u3) over the same `points` points of the unit cube for every lane, k = 0, 1, ...
+    """The mean of draw(k, u1, u2, u3) over the points k = 0, 1, ..., points - 1 of the unit cube.
 
-    Equal lanes give equal means, so there is no noise. The finite number of points leaves a small error.
+    All lanes use the same points, so the mean has no noise, but a small error.
     """
     import mitsuba
 
@@ -136,7 +137,7 @@ def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, ac
 
 
 def over(value: Any, pdf: Any) -> Any:
-    """The value divided by the density; where the density is 0, the value unchanged."""
+    """The value divided by the density. Where the density is 0, the value is returned unchanged."""
     return value * (1.0 / select(pdf > 0, pdf, 1.0))
 
 
@@ -149,7 +150,7 @@ def blended(bsdf: Any) -> bool:
     """Whether any existing Mitsuba BSDF blends `bsdf` with other BSDFs, directly or through nested BSDFs.
 
     A BSDF has no access to the BSDFs that contain it, so this function searches all existing BSDFs. BSDFs that only
-    change the frame or the side do not count as blends.
+    change the shading frame or the side of their nested BSDF do not count as blends.
     """
     global _blends
     everything = _registered()
@@ -159,9 +160,10 @@ def blended(bsdf: Any) -> bool:
     return bsdf.serial in _blends[1]
 
 
-# Unique ids of our BSDFs. Addresses and names are not unique: scenes that are loaded one after another may share them.
+# Unique ids of our BSDFs. Addresses and names are not unique, because scenes that are loaded one after another may
+# reuse them.
 _serials = count(1)
-# The last result of `blended`: all BSDFs at that time, and the ids of our BSDFs inside a blend.
+# The cache of `blended`: a description of all BSDFs at its last call, and the ids of our BSDFs inside a blend.
 _blends: tuple[list[Any], set[int]] = [], set()
 
 

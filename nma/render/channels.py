@@ -1,4 +1,5 @@
-"""Names the channels of a rendered picture: colours, and the other channels that Mitsuba's integrators write."""
+"""Finds the names of the channels of a rendered picture: colours, and the other channels that Mitsuba's integrators
+write."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from nma.images.io import CHANNELS
 
-# IEC 61966-2-1, with the digits of `mitsuba.xyz_to_srgb`.
+# The matrix of IEC 61966-2-1, with the digits of `mitsuba.xyz_to_srgb`.
 _XYZ_TO_SRGB = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]],
     np.float32,
@@ -41,8 +42,8 @@ def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
 def colours(image: NDArray[np.float32], names: list[str]) -> NDArray[np.float32]:
     """The colours of a picture, as linear sRGB (height, width, 3).
 
-    They come from the first three channels where `names` says that these are RGB or XYZ. Otherwise the first channel is
-    shown as grey.
+    If `names` says that the first three channels are RGB or XYZ, they are returned as RGB. Otherwise the first channel
+    is returned as grey.
     """
     if names[:3] == _RGBA[:3]:
         return image[..., :3]

@@ -12,21 +12,23 @@ from nma.ops import Float, Vec3, at_azimuth_0
 from nma.target.brdf import Brdf
 from nma.target.decode import numbers
 
-# For random materials of the training ranges, values at the blend's own samples differed by 1e-4 on average from the
-# network's values at the same cosine, and albedos by 1e-5. Closer nodes at grazing angles changed little.
+# How many cosines have a node. For random materials in the training range, the curves changed BRDF values by 1e-4 on
+# average, at directions sampled from the blend, and albedos by 1e-5. Nodes that lie closer at grazing angles gave about
+# the same errors.
 NODES = 128
-# How many numbers one gather fetches. Dr.Jit fetches a power of two at once; 24 numbers take three gathers of 8.
+# How many numbers one gather fetches. Dr.Jit can fetch a power of two at once, so 24 numbers take three gathers of 8.
 PACKET = 8
-# Smaller cosines are replaced by this one, so that no adapter is evaluated exactly at the horizon.
+# Smaller cosines are replaced by this value, so that no adapter is evaluated exactly at the horizon.
 MIN_COS = 1e-4
 
 
 class Curves:
-    """The numbers of a blend (`nma.target.numbers`) at fixed cosines, linearly interpolated between them.
+    """The numbers that describe a blend (`nma.target.numbers`), stored for fixed cosines and linearly interpolated
+    between these nodes.
 
-    Any mixture of such numbers is a valid blend again. Derivatives with respect to the parameters come from tables of
-    slopes. They do not go through the computation of the curves, because forward derivatives and frozen functions of
-    Dr.Jit could not follow it.
+    Every interpolated list of numbers describes a valid blend. Derivatives with respect to the source parameters come
+    from tables of slopes, because neither forward derivatives nor frozen functions of Dr.Jit could trace the
+    computation of the curves.
     """
 
     # Frozen functions of Dr.Jit look for variables here.
@@ -35,7 +37,7 @@ class Curves:
     def __init__(self, adapter: Adapter, columns: Sequence[Float], nodes: int = NODES):
         """
         Args:
-            adapter: its network is evaluated to make the curves.
+            adapter: the adapter whose network computes the curves.
             columns: `mi.Float` of width 1 for each column of the class's parameter vector.
             nodes: number of cosines; two are used if the target does not depend on the direction.
 
@@ -50,7 +52,7 @@ class Curves:
         self.update(columns)
 
     def update(self, columns: Sequence[Float]) -> None:
-        """Makes the curves anew for other parameters. The kernels are reused if only the values changed."""
+        """Computes the curves again for changed parameters. Dr.Jit reuses the kernels if only the values changed."""
         self.table = self._tabulated([dr.detach(column) for column in columns])
         dr.eval(self.table)
         self.slopes = {
@@ -58,18 +60,18 @@ class Curves:
         }
 
     def at(self, wi: Vec3, columns: Sequence[Float], active: Any = True) -> Brdf:
-        """The BRDF seen from `wi`. `columns` are the parameters from which the curves were made; derivatives need
-        them."""
+        """The BRDF for the view direction `wi`. The derivatives need `columns`, the parameters for which the curves
+        were computed."""
         flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
-                change = columns[k] - dr.detach(columns[k])  # its value is 0, its derivative is not
+                change = columns[k] - dr.detach(columns[k])  # 0, but with the derivative of the column
                 steps = self._looked_up(slope, wi.z, active)
                 flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
         return self.adapter.from_numbers(flat, wi)
 
     def _tabulated(self, columns: Sequence[Float]) -> Float:
-        """The numbers of all nodes, one node after another, padded to whole packets."""
+        """The numbers of all nodes, one node after another, each padded with zeros to whole packets."""
         cosines = dr.maximum(dr.linspace(_mitsuba().Float, 0.0, 1.0, self.nodes), MIN_COS)
         made = _prepare(self.adapter, self.layers, columns, at_azimuth_0(cosines))
         flat = numbers(made.blend, self.adapter.target)
@@ -113,13 +115,14 @@ def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], wi: 
 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:
-    """The first entry of each value, then the second entry of each, and so on. Scalars are repeated to `width`."""
+    """One array with the first entry of each value, then the second entry of each value, and so on. Scalars are
+    repeated `width` times."""
     mi = _mitsuba()
     return dr.ravel(mi.ArrayXf([mi.Float(value) + dr.zeros(mi.Float, width) for value in values]))
 
 
 def _mitsuba() -> Any:
-    """Mitsuba, whose types change with the variant."""
+    """The module `mitsuba`, typed as Any because its types change with the variant."""
     import mitsuba
 
     return mitsuba

@@ -24,9 +24,9 @@ from nma.render.textures import bitmap_texture, procedural_textures
 HEADINGS = ("material", "BSDF", "time", "compile", "variance", "HDR-FLIP", "SMAPE", "efficiency")
 DEPTH = 6
 TEXTURE_SCALE = 2.0
-STAND_IN_RUNS = 2  # runs of `principled`, which is only timed
+STAND_IN_RUNS = 2  # how often `principled` is rendered, of which only the time is reported
 FIRST_SPP = 16  # samples per pixel of the first pictures, which come before the measurements
-# The FLIP error that gets the last colour of the difference picture.
+# FLIP errors of this value or more are shown in the brightest colour of the difference picture.
 FLIP_SCALE = 0.5
 Progress = Callable[[str, int], None]
 
@@ -34,8 +34,8 @@ Progress = Callable[[str, int], None]
 class Settings(NamedTuple):
     """Settings of the demonstration.
 
-    `size`: width and height of a picture. `spp`: samples per pixel of a measured frame. `runs`: frames per BSDF.
-    `reference_spp`: samples per pixel of the references. `adapter`: a weights file.
+    `size`: width and height of a picture. `spp`: samples per pixel of a measured frame. `runs`: measured frames per
+    BSDF. `reference_spp`: samples per pixel of the references. `adapter`: a weights file.
     """
 
     size: tuple[int, int] = (256, 256)
@@ -51,7 +51,8 @@ class Settings(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """The name of a material, its label in the sheet, and Mitsuba's dictionaries of its BSDFs by their names."""
+    """A scene of the demonstration: the material's name, its label in the sheet, and a Mitsuba dictionary for each BSDF
+    name."""
 
     material: str
     label: str
@@ -68,7 +69,7 @@ class Frame(NamedTuple):
 class Line(NamedTuple):
     """One line of the table: a BSDF in one of the scenes.
 
-    `errors`: the errors of its mean over the runs; empty for `principled`.
+    `errors`: the errors of the mean picture of all runs; empty for `principled`.
     """
 
     material: str
@@ -93,9 +94,10 @@ def demo(
     """Render the demonstration and write its sheet: first with few samples, then again after each scene is measured.
 
     Args:
-        path: the PNG, written atomically each time.
-        progress: called with the name of what is being rendered, and the samples per pixel just done.
-        published: called after each writing with a description of what is new in the PNG.
+        path: the PNG file of the sheet, written atomically each time.
+        progress: called after each frame or pass with the name of the picture and the samples per pixel of this frame
+            or pass.
+        published: called each time the PNG has been written, with a description of its new content.
 
     Returns:
         The lines of the table: `principled`, `layered` and `nma` for each scene.
@@ -134,7 +136,7 @@ def total_samples(settings: Settings) -> int:
 
 
 def note(settings: Settings) -> str:
-    """Text that says what the figures mean and on which machine they were measured."""
+    """The text under the table, which explains its columns and names the machine on which they were measured."""
     import mitsuba as mi
 
     width, height = settings.size
@@ -188,7 +190,7 @@ def _load(bsdf: dict[str, Any], settings: Settings) -> Any:
 
 
 def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[str, Frame]:
-    """A frame of few samples for each BSDF: a first picture, and the time with compilation."""
+    """Renders a frame of few samples for each BSDF, as a first picture and to measure the time with compilation."""
     frames = {}
     for name, bsdf in scene.bsdfs.items():
         frames[name] = Frame(*render_seconds(_load(bsdf, settings), settings.first_spp, settings.runs))
@@ -199,7 +201,7 @@ def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[
 def _measured(
     scene: Scene, first: dict[str, Frame], settings: Settings, progress: Progress
 ) -> tuple[NDArray[np.float32], list[Line]]:
-    """The reference picture, rendered with a seed of its own, and the line of each BSDF."""
+    """Returns the reference picture, which has a seed of its own, and the table's line for each BSDF."""
     truth = render_passes(
         _load(scene.bsdfs["layered"], settings),
         settings.reference_spp,
@@ -232,7 +234,7 @@ def _write(path: str | Path, rows: list[Row], lines: list[Line], settings: Setti
 
 
 def _early_row(scene: Scene, frames: dict[str, Frame], settings: Settings) -> Row:
-    """The row of a scene before anything is measured."""
+    """The row of a scene with its first pictures, before anything is measured."""
     truth, adapter = (frames[name].image.astype(np.float32) for name in ("layered", "nma"))
     text = f"{settings.first_spp} spp, figures follow"
     return Row(scene.label, [truth, adapter, _difference(adapter, truth)], [text, text])

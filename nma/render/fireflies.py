@@ -10,9 +10,9 @@ from nma.errors import ParamError
 def clamped(integrator: Any, limit: float) -> Any:
     """An integrator that wraps Mitsuba's `integrator` and limits its samples; pass it to `mi.render`.
 
-    A sample whose brightest channel exceeds `limit` [radiance] is scaled down to the limit and keeps its colour. The
-    light beyond the limit is lost, so pictures become darker, most of all in caustics and wherever few paths find the
-    light.
+    A sample whose brightest channel exceeds `limit` [radiance] is scaled down to the limit, so that it keeps its
+    colour. The radiance beyond the limit is lost, so pictures become darker, most of all in caustics and where few
+    paths reach the light.
 
     Raises:
         ParamError: the integrator does not trace one path for each sample, or it writes channels other than colour.
@@ -24,7 +24,7 @@ def clamped(integrator: Any, limit: float) -> Any:
     mi: Any = mitsuba  # its types change with the variant
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         raise ParamError(
-            "samples can only be clamped if each is one path; use the integrator path, volpath or direct"
+            "samples can be clamped only if each sample is one path; use the integrator path, volpath or direct"
         )
     if integrator.aov_names():
         others = ", ".join(integrator.aov_names())

@@ -38,11 +38,11 @@ def check_numbers(allowed: Allowed, value: Any) -> None:
 
 
 def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: int | None) -> None:
-    """Raises `TextureError` for values that are not allowed, or for colours in a texture of a parameter of one number.
+    """Raises `TextureError` for values that are not allowed, or for a coloured texture of a parameter with one number.
 
     Args:
         leaves: the texture's arrays of pixels and numbers, as far as they are known before rendering.
-        channel: index of the channel that is used, if one was chosen.
+        channel: index of the only channel that the parameter uses, or None if no channel was chosen.
     """
     name = f" ({texture.id()})" if texture.id() else ""
     where = f"the texture of {allowed.param.name}{name}"
@@ -60,8 +60,8 @@ def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: in
 def _plain(value: Any) -> NDArray:
     """The values of a Dr.Jit array as a NumPy array.
 
-    Colours are converted channel by channel. Converting a whole colour scatters it into one array, which cannot be read
-    while Dr.Jit records.
+    Colours are converted channel by channel. Converting a whole colour would scatter the colour into one array, which
+    cannot be read while Dr.Jit records.
     """
     import mitsuba as mi
 
@@ -69,7 +69,8 @@ def _plain(value: Any) -> NDArray:
 
 
 def _decoded(pixels: NDArray, texture: Any) -> NDArray:
-    """The values to which the texture evaluates. Mitsuba keeps 8-bit files as bytes, which are sRGB unless `raw`."""
+    """The values to which the texture evaluates. Mitsuba keeps 8-bit files as bytes, in sRGB unless the texture is
+    `raw`."""
     if pixels.dtype != np.uint8:
         return pixels
     unit = pixels / 255.0

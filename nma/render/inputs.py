@@ -18,17 +18,18 @@ from nma.render.textures import bitmap_texture
 class Inputs:
     """The parameters of a class, read from a BSDF's properties.
 
-    A property has the name of a parameter. Numbers and colours are linear and are not limited to 0 .. 1, because
-    refractive indices are not reflectances; textures of such numbers need `raw`. The property `NAME_channel` ("r", "g"
-    or "b") chooses the channel of a coloured texture for a parameter of one number. The property `material` names a
-    material (a shipped one, or a `.toml` file), whose values are used for the parameters that are not given.
+    Each parameter has a property of the same name. Numbers and colours are linear and may lie outside 0 .. 1, because
+    some are refractive indices, not reflectances. Textures with values outside 0 .. 1 need `raw`. The property
+    `NAME_channel` ("r", "g" or "b") chooses the channel of a coloured texture for a parameter of one number. The
+    property `material` is the name of a shipped material or a `.toml` file. The values of this material are used for
+    the parameters that are not given.
 
     `values` maps each name to a `mi.Float` (size 1), a `mi.Color3f` (size 3) or a `mi.Texture`. Numbers and pixels must
-    be finite and within `bounds`; with `clamp` they are moved to the bounds instead. Values that are not known before
-    rendering (mesh attributes, edits inside frozen functions) are always moved.
+    be finite and within `bounds`; with `clamp`, finite values are clamped to the bounds instead. Values that are not
+    known before rendering (mesh attributes, edits inside frozen functions) are always clamped.
 
-    Kernels read the numbers from memory, so that an edit compiles nothing and materials with the same textured
-        parameters share a kernel.
+    Kernels read the numbers from memory, so an edit compiles nothing, and materials with the same textured parameters
+    share a kernel.
     """
 
     # Frozen functions of Dr.Jit look for variables here.
@@ -44,7 +45,7 @@ class Inputs:
         if missing:
             raise ParamError(
                 f"class {space.name}: no value for {', '.join(missing)}; give each a number, a colour or a texture, "
-                "or name a `material` that has them (`nma materials` lists those shipped)"
+                "or name a `material` that has them (`nma materials` lists the shipped ones)"
             )
         self.values = {param.name: _value(param, given[param.name]) for param in space.params}
         self.chosen = {param.name: _channel(param, props, self.values[param.name]) for param in space.params}
@@ -53,7 +54,7 @@ class Inputs:
 
     @property
     def textured(self) -> tuple[str, ...]:
-        """Names of the parameters that a texture drives."""
+        """Names of the parameters that are given by a texture."""
         import mitsuba as mi
 
         return tuple(name for name, value in self.values.items() if isinstance(value, mi.Texture))
@@ -66,7 +67,7 @@ class Inputs:
         return [channel for param in self.space.params for channel in self.channels(param.name, si, active)]
 
     def channels(self, name: str, si: Any = None, active: Any = True) -> list[Any]:
-        """The one or three channels of a parameter, moved within its bounds."""
+        """The one or three channels of a parameter, clamped to its bounds."""
         import mitsuba as mi
 
         param, value = self.space[name], self.values[name]
@@ -79,7 +80,7 @@ class Inputs:
         return [param.bounds(self.bounds).moved(c) for c in channels]
 
     def traverse(self, callback: Any, differentiable: bool) -> None:
-        """Shows every input to `mi.traverse` under its name."""
+        """Passes every input, by its name, to the `callback` of `mi.traverse`."""
         import mitsuba as mi
 
         flags = mi.ParamFlags.Differentiable if differentiable else mi.ParamFlags.NonDifferentiable
@@ -92,11 +93,12 @@ class Inputs:
     def check(self, numbers: bool = False) -> None:
         """Checks the textures, and with `numbers` all inputs, that have changed since the last check.
 
-        Raises `ParamError` or `TextureError` for a bad value, and restores the last good value first. Dr.Jit records
-        all existing BSDFs, so a BSDF with a bad value would also stop other scenes.
+        Raises `ParamError` or `TextureError` for a bad value, and restores the last good value first. A bad value must
+        not stay, because Dr.Jit records all existing BSDFs, so the error would also stop other scenes.
 
-        It is called wherever inputs are used, because Mitsuba does not report edits of a texture that several BSDFs
-        share. While Dr.Jit freezes a function there are no values to check; edits are then moved within the bounds.
+        BSDFs call this method wherever they use inputs, because Mitsuba does not report edits of a texture that several
+        BSDFs share. While Dr.Jit freezes a function, values cannot be read, so edited values are clamped to the bounds
+        instead.
         """
         import drjit as dr
 
@@ -108,7 +110,8 @@ class Inputs:
             raise fault
 
     def _fault(self, param: Param) -> ParamError | TextureError | None:
-        """The error of a changed input, or None. A bad change is undone; a good one is remembered."""
+        """The error of an input if its value has changed to a bad one, else None. A bad value is replaced by the last
+        good value."""
         import mitsuba as mi
 
         seen, value = self._seen[param.name], self.values[param.name]
@@ -127,7 +130,7 @@ class Inputs:
         return None
 
     def changed(self) -> None:
-        """Checks all inputs after edits. Raises the errors of `check`."""
+        """Checks all inputs after edits, and raises the errors that `check` raises."""
         import drjit as dr
         import mitsuba as mi
 
@@ -140,7 +143,7 @@ class Inputs:
 def of_adapter(adapter: Adapter, props: Any) -> Inputs:
     """The inputs of an adapter: the parameters of its class, or none for an adapter of a single material.
 
-    An adapter of a single material accepts no other material's parameters. Raises `ParamError`.
+    Raises `ParamError` if parameters of another material are given to an adapter of a single material.
     """
     import mitsuba as mi
 
@@ -152,7 +155,7 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
     for name, value in given.items():
         if isinstance(value, mi.Texture):
             raise ParamError(
-                f"the adapter was trained for a single material, so that no texture can drive {name}; leave it out"
+                f"the adapter was trained for a single material, so {name} cannot be textured; leave it out"
             )
         whole = known.copy()
         whole[adapter.space.slices[name]] = value
@@ -208,7 +211,7 @@ class _Seen:
 
 
 def _known(key: str) -> bool:
-    """Whether a texture's entry `key` of `mi.traverse` holds its pixels or its value."""
+    """Whether `key`, a key of `mi.traverse`, stands for the pixels or the value of a texture."""
     return key.rpartition(".")[2] in ("data", "value")
 
 
@@ -220,7 +223,7 @@ def _indices(values: list[Any]) -> list[int]:
 
 
 def _value(param: Param, given: Any) -> Any:
-    """An input as an entry of `Inputs.values`."""
+    """Converts an input to the type that `Inputs.values` has for it."""
     import drjit as dr
     import mitsuba as mi
 
@@ -237,7 +240,7 @@ def _value(param: Param, given: Any) -> Any:
 
 
 def _read(param: Param, props: Any) -> Any:
-    """A property as a number, three numbers, or a texture."""
+    """Reads a property as a number, a list of numbers, or a texture."""
     import mitsuba as mi
 
     kinds: Any = mi.Properties.Type
@@ -256,7 +259,7 @@ def _read(param: Param, props: Any) -> Any:
 
 
 def _numbers(param: Param, channels: Any) -> Any:
-    """The channels of a colour as a parameter's value. A parameter of one number accepts only grey colours."""
+    """The value of a parameter from the channels of a colour. A parameter with one number accepts only grey colours."""
     if not isinstance(channels, list) or param.size == 3:
         return channels
     if len(set(channels)) > 1:
@@ -291,7 +294,8 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
 
 
 def _setting(props: Any, name: str, default: Any) -> Any:
-    """A property that is no parameter. It must have the type of `default`: the text "false" would count as true."""
+    """Reads a property that is not a parameter. Its type must be the type of `default`, or else the text "false" would
+    count as true."""
     value = props.get(name, default)
     if not isinstance(value, type(default)):
         wanted = "true or false (boolean)" if isinstance(default, bool) else "a name (string)"
@@ -300,7 +304,7 @@ def _setting(props: Any, name: str, default: Any) -> Any:
 
 
 def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
-    """The values of a named material, with its textures as Mitsuba textures."""
+    """The parameters of a named material. Textures of the material are converted to Mitsuba textures."""
     import mitsuba
 
     mi: Any = mitsuba  # its types change with the variant

@@ -1,14 +1,16 @@
 """Mitsuba 3 BSDF `layered`: the simulated material, which is the reference for its adapter.
 
-`eval` returns one unbiased random estimate. Mitsuba passes it no random numbers, so it makes them from the bits of its
-arguments. Multiple importance sampling stays unbiased with any density that is positive where f is positive, as long as
-all methods report the same density. This density is `pdf`.
+`eval` returns one unbiased random estimate. Mitsuba passes no random numbers to `eval`, so `eval` makes them from the
+bits of its arguments. The density of the simulated walks is unknown, so `pdf` and `sample` report an approximate
+density. Multiple importance sampling stays unbiased, because the reported density is positive wherever f is positive,
+and `pdf` and `sample` report the same density.
 
-`sample` is one random walk. BSDFs that blend others (`blendbsdf`, `mask`) assume that weight times pdf is the value of
-a sample, which does not hold for a walk. Inside such a BSDF, `sample` draws a direction from `pdf`, and its weight is
-an estimate of the value over `pdf`. This is right in any combination, but it is slower and has 1 to 1.4 times the
-variance of a walk. Inputs: `nma.render.inputs`, with the parameters of class `layered3`. One-sided; wrap it in
-`twosided` if needed.
+`sample` simulates one random walk. BSDFs that blend others (`blendbsdf`, `mask`) assume that weight times pdf is the
+value of f, which is wrong for a walk. Inside such a BSDF, `sample` draws a direction from `pdf`, and its weight is an
+estimate of the value divided by `pdf`. This method is unbiased in every BSDF, but it is slower and has 1 to 1.4 times
+the variance of a walk.
+
+`nma.render.inputs` reads the parameters of class `layered3`. The BSDF is one-sided; wrap it in `twosided` if needed.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3, Stack
 
-# Walks from which the albedo of a point is computed. Their random numbers are the same everywhere, so there is no
-# noise, but an error of up to .06.
+# The albedo at a point is the mean of this many walks. Their random numbers are the same at all points, so the albedo
+# has no noise, but an error of up to .06.
 ALBEDO_WALKS = 128
 
 
@@ -112,7 +114,7 @@ def define() -> type:
             a, b = (a ^ x, b) if i % 2 == 0 else (a, b ^ x)
             if i % 2 == 1 or i == len(bits) - 1:
                 a, b = mi.sample_tea_32(a, b)
-        rng = mi.PCG32()  # its own seeding would also depend on the lane
+        rng = mi.PCG32()  # the seeding of its constructor would also depend on the lane
         rng.state, rng.inc = (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(b) << 1) | 1
         return rng
 
