@@ -155,8 +155,8 @@ def test_clamping_only_darkens_and_removes_fireflies():
 @pytest.mark.parametrize(
     ("integrator", "message"),
     [
-        ({"type": "ptracer"}, "if each is one path"),
-        ({"type": "prb"}, "if each is one path"),
+        ({"type": "ptracer"}, "if each sample is one path"),
+        ({"type": "prb"}, "if each sample is one path"),
         ({"type": "aov", "aovs": "n:sh_normal"}, "beside other channels"),
     ],
 )

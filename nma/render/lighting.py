@@ -1,8 +1,9 @@
-"""Light for the preview scene: a studio of softboxes, or sun, sky and a small lamp. Code makes all of it; there are no
-asset files.
+"""Light for the preview scene: a studio of softboxes, or sun, sky and a small lamp. All lights are computed, so there
+are no asset files.
 
-Each lighting is a dictionary of Mitsuba's emitters. The sky is an image, and Mitsuba samples its pixels by brightness.
-Lengths are in units of the shader ball's radius, and z is up. Directions point from the ball to the light.
+Each lighting is a dictionary of Mitsuba's emitters. The sky is an image, whose pixels Mitsuba samples in proportion to
+their brightness. Lengths are in units of the shader ball's radius, and z is up. Directions point from the shader ball
+to the light.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ Colour = tuple[float, float, float]
 LIGHTINGS = ("studio", "outdoors")
 
 SUN_DIRECTION = (-0.62, -0.50, 0.72)
-SUN_APERTURE = 4.0  # degrees; eight times that of the real sun, so that shadows have soft edges
+SUN_APERTURE = 4.0  # degrees, eight times the aperture of the real sun, so that shadows have soft edges
 SUN_SCALE, SKY_SCALE, TURBIDITY = 1.6, 3.6, 5.0
-SATURATION = 0.5  # of sun and sky; in less blue light the colours of metals are easier to see
+# The colour saturation of sun and sky is reduced, because the colours of metals are easier to see in less blue light.
+SATURATION = 0.5
 GROUND_RADIANCE, HORIZON_BLUR = (0.28, 0.28, 0.28), 0.12
 LAMP_POSITION, LAMP_SIZE, LAMP_RADIANCE = (2.6, -2.4, 3.6), 0.17, (46.0, 42.0, 36.0)
 
 
 class Softbox(NamedTuple):
-    """A rectangle of light, far away.
+    """A rectangular light at infinite distance.
 
     `towards`: direction of its middle. `half`: half its width and half its height, as angles seen from the ball
     [degrees]. `edge`: width of its soft edge [degrees]. `turn`: rotation about the line of sight [degrees].
@@ -45,7 +47,8 @@ class Softbox(NamedTuple):
     radiance: Colour
 
     def coverage(self, direction: Array) -> Array:
-        """How much of the light is seen in directions (..., 3): (...), 1 inside, 0 outside, smooth across the edge."""
+        """The share (...) of the light's radiance in directions (..., 3): 1 inside the rectangle, 0 outside, smooth
+        between."""
         middle = np.array(self.towards) / np.linalg.norm(self.towards)
         right = np.cross(middle, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
@@ -62,20 +65,20 @@ class Softbox(NamedTuple):
 
 
 SOFTBOXES = (
-    # The main light, on the left: two panes with a bar between them. It has most of the power, because a sample spent
-    # on another light is wasted wherever that light does not reach.
+    # The main light, on the left: two panes with a bar between them. It has most of the power, so that most light
+    # samples go to it. Samples of another light are wasted at all points that this other light does not reach.
     Softbox((-0.93, -0.42, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
     Softbox((-0.70, -0.72, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
-    Softbox((0.92, -0.15, 0.42), (1.8, 28.0), 1.0, 8.0, (11.8, 12.5, 13.7)),  # strip on the right
+    Softbox((0.92, -0.15, 0.42), (1.8, 28.0), 1.0, 8.0, (11.8, 12.5, 13.7)),  # a strip on the right
     Softbox((0.05, 0.70, 0.72), (32.0, 1.8), 1.0, 0.0, (9.4, 9.4, 9.4)),  # a bar above and behind
     Softbox((-0.85, 0.50, 0.25), (1.8, 18.0), 1.0, 0.0, (8.8, 8.8, 8.8)),  # a strip behind, on the left
 )
 HORIZON, ZENITH = (0.038, 0.038, 0.041), (0.20, 0.22, 0.255)
-SKY_RISE = 0.55  # sine of the elevation where the sky is as bright as at the zenith
+SKY_RISE = 0.55  # from the elevation with this sine upwards, the dome is as bright as at the zenith
 
 
 def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
-    """Mitsuba's dictionaries of the lights of a named lighting, by their keys in the scene.
+    """The lights of the lighting with this name: a Mitsuba dictionary for each key of the scene.
 
     Raises:
         ParamError: no lighting has that name, or `hide_sun` is set and the lighting has no sun.
@@ -90,7 +93,7 @@ def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
 
 
 def environment(path: Path, scale: float) -> dict[str, Any]:
-    """An environment map as the only light: Mitsuba's dictionary, under the key `sky`.
+    """An environment map as the only light: its Mitsuba dictionary under the key `sky`.
 
     Raises:
         ParamError: the file does not exist, is not an image, or has pixels that are not finite.
@@ -111,7 +114,7 @@ def studio_radiance(height: int = 512) -> NDArray[np.float32]:
     """The studio as an image: (height, 2 height, 3) linear sRGB, latitude-longitude, up at the top.
 
     The softboxes hang in a dim dome that darkens towards the horizon, so that smooth coats have edges to reflect. No
-    light is small or very bright, so a path that hits a light by chance adds little noise.
+    light is both small and very bright, so a path that hits a light by chance adds little noise.
     """
     direction = sky_directions(height)
     rise = smoothstep(direction[..., 2:] / SKY_RISE)
@@ -125,9 +128,10 @@ def studio_radiance(height: int = 512) -> NDArray[np.float32]:
 def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.float32]:
     """Mitsuba's `sunsky` as an image: (height, 2 height, 3) linear sRGB, latitude-longitude, up at the top.
 
-    Mitsuba importance-samples the sun of an image. A scene of the floor alone then has 51 times less variance per
-    sample than with the `sunsky` emitter. The model is black below the horizon, so this image fades into the floor's
-    colour there. Further down it stays black: the floor hides that part, and black pixels take no samples.
+    As Mitsuba importance-samples the pixels of an image, a scene with only the floor has 51 times less variance per
+    sample than with the emitter `sunsky`. Mitsuba's model is black below the horizon. Just below the horizon, this
+    image fades into the floor's colour. Further down the image stays black, because the floor hides that part and black
+    pixels get no samples.
     """
     import drjit as dr
     import mitsuba as mi
@@ -146,7 +150,7 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
     model = {"type": "sunsky", "sun_direction": list(SUN_DIRECTION), "sun_aperture": SUN_APERTURE}
     model |= {"sun_scale": sun_scale, "sky_scale": SKY_SCALE, "turbidity": TURBIDITY}
 
-    # Directions below the horizon take the sky's colour just above it; then they are blended with the ground's colour.
+    # Pixels below the horizon get the sky's colour just above the horizon, blended with the ground's colour.
     cosine = sky_directions(height)[..., 2]
     direction = sky_directions(height, lowest=0.01).reshape(-1, 3)
     si = dr.zeros(mi.SurfaceInteraction3f, len(direction))
@@ -159,7 +163,7 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
 
 
 def sky_directions(height: int, lowest: float = -1.0) -> Array:
-    """The direction of each pixel of a latitude-longitude image: (height, 2 height, 3), z up; z is at least
+    """The direction of each pixel of a latitude-longitude image: (height, 2 height, 3). z is up, and at least
     `lowest`."""
     azimuth = (np.arange(2 * height) + 0.5) / height * np.pi
     polar = (np.arange(height) + 0.5) / height * np.pi
@@ -170,7 +174,7 @@ def sky_directions(height: int, lowest: float = -1.0) -> Array:
 
 
 def smoothstep(x: Array) -> Array:
-    """A smooth step of the shape of x: 0 where x < 0, 1 where x > 1, and 3 x^2 - 2 x^3 between."""
+    """A smooth step for each element of x: 0 where x < 0, 1 where x > 1, and 3 x^2 - 2 x^3 between."""
     t = np.clip(x, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -188,7 +192,7 @@ def _image(radiance: NDArray[np.float32]) -> dict[str, Any]:
 
 
 def _lamp() -> dict[str, Any]:
-    """A small square lamp high on the right that shows how sharp a coat is."""
+    """A small square lamp high on the right, whose reflection shows how smooth a coat is."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f().look_at(list(LAMP_POSITION), [0.0, 0.0, 1.1], [0.0, 0.0, 1.0])
@@ -201,7 +205,8 @@ def _lamp() -> dict[str, Any]:
 
 
 def _upright() -> Any:
-    """The transform from Mitsuba's environment maps, where y is up, to the scene, where z is up."""
+    """The transform from the frame of Mitsuba's environment maps, where y is up, to the frame of the scene, where z is
+    up."""
     import mitsuba as mi
 
     return mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0)

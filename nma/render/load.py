@@ -14,7 +14,7 @@ from nma.materials import Material, Texture
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.textures import bitmap_texture
 
-# File name endings of the images that Mitsuba reads.
+# The file name endings of the image formats that Mitsuba reads.
 _IMAGES = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 
 MODELS = ("nma", "layered")
@@ -33,7 +33,7 @@ def material_bsdf(
         material: returned by `nma.materials.load`. Its textures are read and checked here.
         model: "nma" (the adapter) or "layered" (the reference).
         adapter: name of a shipped adapter or a weights file, for "nma".
-        clamp: whether parameters beyond the adapter's training range are moved to its bounds, or refused.
+        clamp: whether parameters outside the adapter's training range are clamped to that range instead of refused.
 
     Raises:
         ParamError: the model is unknown.
@@ -46,7 +46,7 @@ def material_bsdf(
 
 
 def load_dict(description: Mapping[str, Any]) -> Any:
-    """Calls `mi.load_dict`; its errors become `SceneError`."""
+    """Calls `mi.load_dict`, and raises `SceneError` if this function fails."""
     import mitsuba as mi
 
     try:
@@ -62,7 +62,7 @@ def load_scene(
 
     Args:
         define: values of the parameters that the file writes as `$name`.
-        size: width and height in pixels for the first sensor, in place of those in the file.
+        size: width and height in pixels for the first sensor, in place of the size in the file.
 
     Raises:
         SceneError: there is no such file, or Mitsuba cannot load it.
@@ -89,7 +89,7 @@ def load_scene(
 
 
 def _check_images(path: Path) -> None:
-    """Raises `ImageError` for a too large image named in the file, before Mitsuba takes memory for its pixels."""
+    """Raises `ImageError` if the scene file names an image that is too large, before Mitsuba allocates its pixels."""
     for name in re.findall(rb'value\s*=\s*"([^"]+)"', path.read_bytes()):
         image = path.parent / os.fsdecode(name)
         if image.suffix.lower() in _IMAGES and image.is_file():

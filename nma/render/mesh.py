@@ -14,8 +14,8 @@ from nma.errors import NmaError, either, one_line
 
 KINDS = {".ply": "ply", ".obj": "obj"}
 AXES = ("z", "y")
-WIDTH, HEIGHT = 2.0, 2.12  # of the shader ball; the mesh is scaled to fit into them
-LIFT = 1e-3  # height above the floor, so that flat meshes are visible
+WIDTH, HEIGHT = 2.0, 2.12  # the size of the shader ball, to which the mesh is scaled
+LIFT = 1e-3  # height of the mesh above the floor, so that flat meshes are visible
 ATTRIBUTES = {"positions": 3, "normals": 3, "texcoords": 2}
 
 
@@ -24,9 +24,9 @@ class MeshError(NmaError, ValueError):
 
 
 def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) -> dict[str, Any]:
-    """Mitsuba's dictionary of a mesh that stands in the place of the shader ball and has its size.
+    """Mitsuba's dictionary of a mesh that is moved to the place of the shader ball and scaled to its size.
 
-    Normals and texture coordinates come from the file; Mitsuba computes normals that are missing.
+    Normals and texture coordinates come from the file. Mitsuba computes the normals if the file has none.
 
     Args:
         path: a PLY or OBJ file.
@@ -34,8 +34,8 @@ def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) ->
         coordinates: whether texture coordinates are needed.
 
     Raises:
-        MeshError: the file does not exist or is not a mesh; the mesh has no triangles, no extent, values that are not
-            finite, or no texture coordinates although they are needed; or the axis is unknown.
+        MeshError: the file does not exist or is not a mesh, the axis is unknown, or the mesh has no triangles, no
+            extent, values that are not finite, or no texture coordinates although they are needed.
     """
     import mitsuba as mi
 
@@ -76,8 +76,8 @@ def _load(description: dict[str, Any], path: str | Path) -> Any:
     import mitsuba as mi
 
     try:
-        # Computing normals, Mitsuba fails without triangles and writes out of bounds for wrong vertex indices, so the
-        # faces are checked first, on a mesh whose normals it does not compute.
+        # When Mitsuba computes normals, it fails without triangles, and writes out of bounds for wrong vertex indices.
+        # So the faces are checked first, on a mesh with `face_normals`, for which Mitsuba computes no normals.
         _check_faces(mi.load_dict(description | {"face_normals": True}), path)
         return mi.load_dict(description)
     except RuntimeError as error:
@@ -100,8 +100,8 @@ def _check_faces(mesh: Any, path: str | Path) -> None:
 
 
 def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:
-    """The corners (n, 3) of all triangles in turn. Checks that positions, normals and texture coordinates are
-    finite."""
+    """The corners (n, 3) of all triangles, one triangle after another. Raises `MeshError` if a position, a normal or a
+    texture coordinate is not finite."""
     import mitsuba as mi
 
     params = mi.traverse(mesh)
@@ -117,7 +117,7 @@ def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:
 
 
 def _place(points: NDArray[np.float64], path: str | Path) -> Any:
-    """The transform that puts the mesh on the middle of the floor and scales it to the ball's size."""
+    """The transform that scales a mesh to the shader ball's size and puts it on the middle of the floor."""
     import mitsuba as mi
 
     low, high = points.min(axis=0), points.max(axis=0)

@@ -13,9 +13,9 @@ from nma.errors import ParamError, one_line
 from nma.images.size import MOST_PIXELS
 from nma.render.load import SceneError
 
-# Samples of one pass, over the whole picture. They take a few seconds on two cores, and they bound the memory. At 512 x
-# 512 pixels this is 16 samples per pixel. More samples per pass leave less noise, because the sampler stratifies within
-# a pass.
+# The number of samples of one pass over the whole picture: 16 samples per pixel for 512 x 512 pixels. A pass takes a
+# few seconds on two cores. Fewer samples per pass need less memory, but leave more noise, because the sampler
+# stratifies only within a pass.
 SAMPLES_PER_PASS = 1 << 22
 
 
@@ -35,7 +35,7 @@ def render_passes(
     Args:
         scene: what `mi.load_dict` or `mi.load_file` returned.
         spp: samples per pixel in total; the last pass may be smaller than the others.
-        integrator: an integrator to use in place of the scene's.
+        integrator: an integrator to use in place of the scene's integrator.
         progress: called after each pass with the samples per pixel of that pass.
 
     Raises:
@@ -45,7 +45,7 @@ def render_passes(
     import mitsuba as mi
 
     if spp < 1:
-        raise ParamError(f"{spp} samples per pixel; take at least 1")
+        raise ParamError(f"{spp} samples per pixel are too few; take at least 1")
     if integrator is None and scene.integrator() is None:
         raise SceneError('the scene has no integrator; add one, <integrator type="path"/> for example')
     width, height = map(int, scene.sensors()[sensor].film().crop_size())
@@ -64,7 +64,7 @@ def render_passes(
 
 
 def check_size(size: tuple[int, int]) -> None:
-    """Raises `ParamError` for pictures of more than `MOST_PIXELS` pixels, before memory is taken."""
+    """Raises `ParamError` for pictures of more than `MOST_PIXELS` pixels, before memory is allocated."""
     if size[0] * size[1] > MOST_PIXELS:
         raise ParamError(
             f"a picture of {size[0]} x {size[1]} pixels is too large; take at most {MOST_PIXELS:,} pixels, "
@@ -73,9 +73,10 @@ def check_size(size: tuple[int, int]) -> None:
 
 
 def pass_sizes(spp: int, pixels: int) -> list[int]:
-    """Samples per pixel of each pass. All passes are equal, except that the last may be smaller.
+    """The samples per pixel of each pass. All passes have the same number of samples, except that the last pass may
+    have fewer.
 
-    The counts suit the multi-jittered sampler's grids where possible.
+    Where possible, these numbers fill the grid of the multi-jittered sampler.
     """
     most = max(SAMPLES_PER_PASS // pixels, 1)
     equal = -(-spp // -(-spp // most))
@@ -90,10 +91,11 @@ def sampler(spp: int, pixels: int) -> str:
 
 
 def _fills_grid(samples: int) -> bool:
-    """Whether Mitsuba's multi-jittered sampler takes exactly this sample count; it rounds other counts up."""
+    """Whether Mitsuba's multi-jittered sampler takes exactly this number of samples. It rounds other numbers up."""
     return samples % max(math.isqrt(samples), 1) == 0
 
 
 def _pass_seed(seed: int, number: int) -> int:
-    """The seed of pass `number`. It is a hash: seed + number would repeat passes of the next seed."""
+    """The seed of pass `number`. This seed is a hash, because with seed + number, pass 1 of one seed would repeat pass
+    0 of the next seed."""
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])

@@ -23,8 +23,8 @@ _registered = False
 def register() -> None:
     """Registers the plugins now, if a variant is set, and again after every `mi.set_variant`. Further calls do nothing.
 
-    Mitsuba keeps Python plugins per variant. scalar_rgb and the `mitsuba` executable need compiled plugins: `nma
-    mitsuba build`.
+    Mitsuba stores Python plugins separately for each variant. scalar_rgb and the `mitsuba` executable need compiled
+    plugins, which `nma mitsuba build` compiles.
     """
     global _registered
     import mitsuba as mi
@@ -50,7 +50,7 @@ def _on_variant(old: str | None, new: str) -> None:
 
 
 def _refuse(variant: str, props: Any) -> Any:
-    """Raises an error in place of making a BSDF, for variants in which our BSDFs do not run."""
+    """Raises an error when a scene needs one of our BSDFs in a variant in which our BSDFs do not run."""
     raise ParamError(
         f"BSDF '{props.plugin_name()}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters "
         "are RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for "
@@ -59,7 +59,7 @@ def _refuse(variant: str, props: Any) -> Any:
 
 
 def _add_resource(folder: str) -> None:
-    """Puts a folder on Mitsuba's resource path, once."""
+    """Adds a folder to Mitsuba's resource path, unless the path already has the folder."""
     import mitsuba
 
     mi: Any = mitsuba  # its type stubs lack this function

@@ -1,11 +1,12 @@
 """The material-preview scene: the shader ball, or a mesh, on graph paper under a lighting of `nma.render.lighting`.
 
-Code makes all of it; there are no asset files. The scene is a Mitsuba dictionary, so callers can change it before
-`mi.load_dict`. `mi.traverse` shows these names: `material.*` is the material under test, `floor.*` the paper, `sky.*`
-the sky, `lamp.*` the lamp (outdoors only), `sensor.*` the camera. Only the shape `ball` has the material.
+The whole scene is computed, so there are no asset files. The scene is a Mitsuba dictionary, so callers can change it
+before `mi.load_dict`. In `mi.traverse`, the parameters of the material under test have the names `material.*`, those of
+the paper `floor.*`, of the sky `sky.*`, of the lamp (outdoors only) `lamp.*`, and of the camera `sensor.*`. Only the
+shape `ball` has the material.
 
 Lengths are in units of the shell's radius, and z is up. Radiance is scaled so that pictures look right at exposure 0
-(`nma.images.io.tonemap`): outdoors, perfectly white paper has radiance 0.77 in the sun.
+(`nma.images.io.tonemap`). For example, perfectly white paper would have radiance 0.77 in the sun.
 """
 
 from __future__ import annotations
@@ -41,9 +42,10 @@ CAMERAS: dict[str, Camera] = {
     "top": Camera((0.25, -2.0, 5.6), (0.0, -0.02, 0.9), 26.0),
 }
 
-PAPER_SIZE = 240.0  # side of the floor; the pattern fades out far from the edge
-PAPER_PATTERN = 24.0  # side of the part that carries the pattern
-# Reflectance of the paper far away, what is added to it near the ball, and the contrast of the pattern.
+PAPER_SIZE = 240.0  # side length of the floor, whose edge lies far beyond the pattern
+PAPER_PATTERN = 24.0  # side length of the part with the pattern, around the ball
+# For each lighting: the paper's reflectance far from the ball, how much higher the reflectance is near the ball, and
+# the contrast of the pattern.
 PAPER_TONE = {"outdoors": (0.60, 0.25, 1.0), "studio": (0.08, 0.45, 0.5)}
 
 
@@ -64,32 +66,32 @@ def preview_scene(
     rfilter: str = "box",
     sampler: str = "independent",
 ) -> dict[str, Any]:
-    """The preview scene around one material, ready for `mi.load_dict`.
+    """The preview scene with the given material, ready for `mi.load_dict`.
 
     Args:
         bsdf: Mitsuba dictionary of the material; it is placed under the key `material`.
         size: width and height in pixels.
-        spp: samples per pixel, the default of `mi.render(scene)`.
-        max_depth: longest path in edges, as Mitsuba counts them (1 shows emission only).
+        spp: samples per pixel that `mi.render(scene)` takes by default.
+        max_depth: the largest number of edges of a path, as Mitsuba counts them (1 shows only emitters).
         camera: a name in `CAMERAS`, a `Camera`, or None for "hero".
         envmap: an EXR or HDR file, latitude-longitude, y up in the file. It replaces all other light.
         envmap_scale: factor on the environment map's radiance.
         lighting: "studio" (softboxes in a dim dome) or "outdoors" (sun, sky and a small lamp).
         mesh: a PLY or OBJ file to show in place of the shader ball, moved to its place and scaled to its size.
-        mesh_up: the axis of that file that points up, "z" or "y".
+        mesh_up: the axis of the mesh file that points up, "z" or "y".
         integrator: "path", "prb", the name of another Mitsuba integrator that takes `max_depth`, or the dictionary of
             an integrator.
-        hide_sun: leave out the disc of the sun; the sky and the lamp stay. For "outdoors" only.
+        hide_sun: whether to leave out the disc of the sun, but not the sky and the lamp. For "outdoors" only.
         rfilter: reconstruction filter of the film. "box" keeps pixels statistically independent.
         sampler: name of a Mitsuba sampler. "multijitter" leaves less noise, but takes only certain sample counts; see
             `nma.render.progressive.sampler`.
 
     Returns:
-        A new dictionary; nothing in it is shared with other calls.
+        A new dictionary, which shares nothing with the dictionaries of other calls.
 
     Raises:
         ParamError: the camera or the lighting is unknown, the size or spp is not positive, the environment map is
-            missing, or no variant of Mitsuba is in use.
+            missing, or no variant of Mitsuba is set.
         MeshError: the mesh cannot be shown; see `nma.render.mesh.mesh_shape`.
     """
     import mitsuba as mi
@@ -112,7 +114,7 @@ def preview_scene(
 
 
 def resolve_camera(camera: str | Camera | None) -> Camera:
-    """The camera: looked up in `CAMERAS` where a name is given, "hero" for None.
+    """Returns the given camera, the camera of `CAMERAS` with the given name, or the camera "hero" for None.
 
     Raises:
         ParamError: no camera has that name.
@@ -142,7 +144,7 @@ def material_mask(
     middle = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, middle, mi.Point2f(0.5))
 
-    # Comparing the shapes' pointers tells the ball from the floor.
+    # The pointer of the shape that a ray hits is the ball's pointer or the floor's pointer.
     ball = next(shape for shape in scene.shapes() if shape.id() == "ball")
     return np.array(scene.ray_intersect(ray).shape == mi.ShapePtr(ball)).reshape(height, width)
 
@@ -153,7 +155,7 @@ def material_coverage(size: tuple[int, int] = (256, 256), camera: str | Camera |
 
 
 def _subject(bsdf: Mapping[str, Any], mesh: str | Path | None, up: str) -> dict[str, Any]:
-    """The shape that shows the material."""
+    """The shape that has the material: the given mesh or the shader ball."""
     if mesh is None:
         return {"type": "ply", "filename": str(shader_ball_file())}
     return mesh_shape(mesh, up=up, coordinates=needs_coordinates(bsdf))
@@ -199,7 +201,8 @@ def _floor(far: float, near: float, contrast: float) -> dict[str, Any]:
 
 @lru_cache(maxsize=2)
 def _graph_paper(size: int, far: float, near: float, contrast: float) -> NDArray[np.float32]:
-    """Linear reflectance (size, size, 3) of the paper, with fine lines, bold lines, and every other square darker."""
+    """Linear reflectance (size, size, 3) of the paper, with fine lines, bold lines, and a checkerboard of slightly
+    darker squares."""
     place = (np.arange(size) + 0.5) / size * PAPER_PATTERN - PAPER_PATTERN / 2.0
     x, y = np.meshgrid(place, place)
     texel = PAPER_PATTERN / size

@@ -1,8 +1,7 @@
 """A shader ball made by code: an open shell with a groove, a small ball inside it, and the ring it stands on.
 
-Every part is a solid of revolution, so texture coordinates follow from the construction: u runs around the axis, v
-along the profile. At a pole all values of u meet in one point; the axes are chosen so that no pole faces the default
-camera.
+Every part is a solid of revolution. Texture coordinate u runs around the axis, and v runs along the profile. At a pole
+all values of u meet in one point, so the axes are chosen such that no pole faces the default camera.
 
 The shell's outer radius is 1. The ring stands on the plane z = 0, and z is up.
 """
@@ -24,10 +23,10 @@ from nma.files import write_bytes
 Array = NDArray[np.float64]
 
 SHELL_CENTRE = np.array([0.0, 0.0, 1.12])
-SHELL_AXIS = np.array([0.56, -0.66, 0.50])  # the opening looks along this direction
-SHELL_OPENING = np.radians(52.0)  # polar angle of the top of the lip
+SHELL_AXIS = np.array([0.56, -0.66, 0.50])  # from the shell's centre to the middle of its opening
+SHELL_OPENING = np.radians(52.0)  # angle between SHELL_AXIS and the top of the lip around the opening
 LIP_RADIUS = 0.07
-CAVITY_OFFSET = 0.16  # the cavity is part of a sphere; its centre lies this far along the axis
+CAVITY_OFFSET = 0.16  # distance along SHELL_AXIS from the shell's centre to that of the cavity's sphere
 GROOVE_ANGLE = np.radians(76.0)
 GROOVE_HALF_WIDTH = np.radians(3.6)
 GROOVE_DEPTH = 0.055
@@ -35,7 +34,7 @@ CORE_RADIUS = 0.41
 CORE_AXIS = np.array([-0.75, 0.45, 0.35])
 RING_RADII = (0.44, 0.74)
 RING_HEIGHT = 0.215
-TEXELS_PER_TURN = 2  # a texture repeats this often around the shell
+TEXELS_PER_TURN = 2  # how often a texture repeats around the shell
 
 
 class Mesh(NamedTuple):
@@ -54,7 +53,7 @@ def shader_ball(detail: float = 1.0) -> Mesh:
         detail: factor on the number of segments in both directions; 1 gives about 54,000 triangles.
 
     Returns:
-        A closed mesh whose faces and smooth normals point outwards; textures repeat with period 1 in u and v.
+        A closed mesh whose faces and smooth normals point outwards. Textures repeat with period 1 in u and v.
     """
     shell = revolve(
         _shell_profile(), round(200 * detail), round(100 * detail), SHELL_AXIS, repeats=TEXELS_PER_TURN
@@ -72,16 +71,16 @@ def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int
     """Turn a profile around an axis through the origin.
 
     Args:
-        profile: (n, 2) points (radius, height), close together; the outside of the surface is to the left of the
-            direction of travel.
-        turns: segments around the axis.
-        steps: segments along the profile; they are shorter where the profile turns.
+        profile: (n, 2) points (radius, height) that lie close together. The outside of the surface is to the left of
+            the direction from each point to the next.
+        turns: number of segments around the axis.
+        steps: number of segments along the profile. They are shorter where the profile turns.
         axis: direction of the axis of revolution, of any length.
-        repeats: how often u runs from 0 to 1 in one turn; v is scaled so that textures are not stretched at the largest
+        repeats: how often u runs from 0 to 1 in one turn. v is scaled so that textures are not stretched at the largest
             radius.
 
     Returns:
-        The mesh; its normals come from the profile's tangent.
+        The mesh, whose normals are perpendicular to the tangent of the profile.
     """
     radius, height, normal, length = _resample(profile, steps)
     phi = np.linspace(0.0, 2.0 * np.pi, turns + 1)
@@ -103,7 +102,8 @@ def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int
 
 @lru_cache(maxsize=4)
 def shader_ball_file(detail: float = 1.0) -> Path:
-    """The path of a binary PLY file of the shader ball. The first call writes it to this process's temporary folder."""
+    """The path of a binary PLY file of the shader ball. The first call writes the file to this process's temporary
+    folder."""
     path = _scratch_folder() / f"shaderball-{detail:g}.ply"
     write_ply(path, shader_ball(detail))
     return path
@@ -129,7 +129,7 @@ def _scratch_folder() -> Path:
 
 
 def _arc(radius: float | Array, start: float, stop: float, count: int = 2000) -> Array:
-    """Points (count, 2) of an arc, as (radius, height), at polar angles from start to stop; `radius` may vary."""
+    """Points (radius, height) (count, 2) of an arc at polar angles from `start` to `stop`. `radius` may be an array."""
     theta = np.linspace(start, stop, count)
     return np.stack([radius * np.sin(theta), radius * np.cos(theta)], axis=-1)
 
@@ -153,7 +153,8 @@ def _shell_profile() -> Array:
     rim = np.arctan2(middle[0], middle[1] - CAVITY_OFFSET)
     inside = _arc(radius, np.pi, rim) + np.array([0.0, CAVITY_OFFSET])
 
-    # The lip turns from the direction of the cavity's centre to the outward direction of the shell.
+    # The angles of the lip's arc around its centre go from the direction of the cavity's centre to the outward
+    # direction of the shell.
     turn = np.linspace(rim - np.pi, SHELL_OPENING, 400)
     lip = middle + LIP_RADIUS * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
 
@@ -186,14 +187,15 @@ def _ring_profile() -> Array:
 
 
 def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
-    """Radius, height, outward normal (n, 2) and arc length at steps + 1 places, denser where the profile turns."""
+    """Radius, height, outward normal (n, 2) and arc length at steps + 1 points, which lie closer where the profile
+    turns."""
     delta = np.diff(profile, axis=0)
     piece = np.linalg.norm(delta, axis=1)
     delta, start, piece = delta[piece > 1e-9], profile[:-1][piece > 1e-9], piece[piece > 1e-9]
     points = np.concatenate([start, profile[-1:]])
     length = np.concatenate([[0.0], np.cumsum(piece)])
 
-    # The tangent's angle at the middle of each segment, interpolated to the segments' ends.
+    # The tangent's angle is known at the middle of each segment, and interpolated to the segments' ends.
     angle = np.unwrap(np.arctan2(delta[:, 1], delta[:, 0]))
     middles = (length[:-1] + length[1:]) / 2.0
     at_points = np.interp(length, middles, angle)
@@ -207,7 +209,7 @@ def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _grid_faces(rows: int, columns: int, radius: Array) -> NDArray[np.int32]:
-    """Two triangles (m, 3) for each cell of a grid of vertices; triangles without area at a pole are left out."""
+    """Two triangles (m, 3) for each cell of a grid of vertices, without the triangles at a pole that have no area."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     lower, upper = np.stack([a, d, c], -1), np.stack([a, c, b], -1)
@@ -218,7 +220,8 @@ def _grid_faces(rows: int, columns: int, radius: Array) -> NDArray[np.int32]:
 
 
 def _frame(axis: Array) -> Array:
-    """A rotation matrix whose third row is the axis; the first two rows are directions perpendicular to it."""
+    """A rotation matrix whose third row is the unit axis. The first two rows are directions perpendicular to the
+    axis."""
     z = axis / np.linalg.norm(axis)
     x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)

@@ -1,4 +1,5 @@
-"""Statistics of renderings: time and noise over independent seeds, and a test whether two have equal means."""
+"""Statistics of renderings: time and noise over independent seeds, and a test whether two renderings have equal
+means."""
 
 from __future__ import annotations
 
@@ -18,9 +19,10 @@ Array = NDArray[np.float64]
 class Measurement(NamedTuple):
     """The result of several runs of one rendering, each with its own seed.
 
-    `mean`: (height, width, 3) float64. `variance`: of the same shape, the unbiased variance of ONE run of `spp`
-    samples, not of the mean. `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`: median wall time of
-    a run. `compile_seconds`: how much longer the warm-up took; 0 without warm-up. `times`: seconds of each run.
+    `mean`: (height, width, 3) float64. `variance`: an array of the same shape, the unbiased variance of ONE run of
+    `spp` samples, not of the mean. `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`: median wall
+    time of a run. `compile_seconds`: how much longer the warm-up took than a run; 0 without warm-up. `times`: seconds
+    of each run.
     """
 
     mean: Array
@@ -43,11 +45,11 @@ class Measurement(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Result of `zscore_images`.
+    """The result of `zscore_images`.
 
-    `p_values`: (rows, columns, channels) of blocks, two-sided. `level`: the test fails for p-values below this level,
-    which includes Sidak's correction. `passed`: whether no p-value is below `level`. `worst`: (row, column, channel) of
-    the smallest p-value.
+    `p_values`: the two-sided p-value of each block of pixels, (rows, columns, channels). `level`: the level of each
+    single test, after Sidak's correction. `passed`: whether no p-value is below `level`. `worst`: (row, column,
+    channel) of the smallest p-value.
     """
 
     p_values: Array
@@ -65,13 +67,13 @@ def measure(
     progress: Callable[[], None] = lambda: None,
     **render_options: Any,
 ) -> Measurement:
-    """Render a loaded scene once for each seed. The clock of a run stops when all its kernels have finished.
+    """Render a loaded scene once for each seed. The time of a run ends when all its kernels have finished.
 
     Args:
         scene: what `mi.load_dict` returned.
         spp: samples per pixel of each run.
-        seeds: how many seeds to take (0 to n - 1), or the seeds themselves; at least 2, all different.
-        warmup: first render once with another seed, so that no measured run includes compilation.
+        seeds: a number n of seeds, which are then 0 to n - 1, or the seeds themselves; at least 2, all different.
+        warmup: whether to render once first, with another seed, so that no measured run includes compilation.
         progress: called after each run, also after the warm-up.
         render_options: passed to `mi.render`, such as `sensor` or `integrator`.
 
@@ -81,14 +83,14 @@ def measure(
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if len(numbers) < 2 or len(set(numbers)) < len(numbers):
         raise ParamError(
-            f"measure: seeds {numbers} will not do; pass at least two different seeds, or their count"
+            f"measure: at least two seeds are needed, all different, got {numbers}; pass such seeds, or a number"
         )
     first = 0.0
     if warmup:
         first = render_seconds(scene, spp, max(numbers) + 1, **render_options)[1]
         progress()
 
-    # Welford's update keeps one mean and one sum of squares, whatever the number of runs.
+    # Welford's update needs memory for only one mean and one sum of squares, whatever the number of runs.
     times, mean, squares = [], np.zeros(()), np.zeros(())
     for count, seed in enumerate(numbers, start=1):
         image, seconds = render_seconds(scene, spp, seed, **render_options)
@@ -103,8 +105,8 @@ def measure(
 
 
 def render_seconds(scene: Any, spp: int, seed: int, **render_options: Any) -> tuple[Array, float]:
-    """One rendering (height, width, channels) as float64, and its wall time in seconds until all kernels have
-    finished."""
+    """Renders a scene once. Returns the picture (height, width, channels) as float64, and the wall time in seconds
+    until all kernels have finished."""
     import drjit as dr
     import mitsuba as mi
 
@@ -131,23 +133,25 @@ def zscore_images(
 ) -> Agreement:
     """Test whether two renderings have the same expectation everywhere, pixel by pixel and channel by channel.
 
-    This is Welch's t-test, a Z-test with estimated variances (Jung, Hanika and Dachsbacher 2020). Its degrees of
-    freedom come from Welch and Satterthwaite; with many runs it becomes the normal test. Each single test has Sidak's
-    level, 1 - (1 - false_alarm)^(1/tests), so that the probability that any of them rejects equal images is about
-    `false_alarm`. Where few paths find light, runs of few samples are far from normally distributed and fail too often:
-    then prefer few long runs to many short runs.
+    This is Welch's t-test, a Z-test with estimated variances (Jung, Hanika and Dachsbacher 2020). The degrees of
+    freedom come from the equation of Welch and Satterthwaite; with many runs the t-distribution approaches the normal
+    distribution. Each single test has Sidak's level, 1 - (1 - false_alarm)^(1/tests), so that equal images fail in any
+    of the tests with a probability of about `false_alarm`. Where few paths reach the light, runs of few samples are far
+    from normally distributed, and equal images fail too often. In such scenes, use few long runs instead of many short
+    runs.
 
-    It needs scipy, which comes with the extras `compare` and `train`.
+    This function needs scipy, which comes with the extras `compare` and `train`.
 
     Args:
-        mean_a, variance_a, runs_a: mean over the runs and variance of one run, both (height, width, channels), and the
-            number of runs.
-        mean_b, variance_b, runs_b: the same for the other rendering. Pass 1 run and variance 0 for an exact image.
+        mean_a, variance_a, runs_a: the mean of all runs and the variance of one run, both (height, width, channels),
+            and the number of runs.
+        mean_b, variance_b, runs_b: the same for the other rendering. For an image without noise, pass variance 0 and
+            one run.
         false_alarm: probability that equal renderings are rejected.
-        block: average squares of block x block pixels before the test, so that small differences everywhere rise above
-            the noise. Pixels must be independent, as they are with the box filter. Rows and columns that fill no block
-            are left out.
-        rounding: relative difference that single precision may cause; it adds to the standard error.
+        block: side of the squares of pixels that are averaged before the test, so that a small difference in all pixels
+            exceeds the noise. Pixels must be independent, as they are with the box filter. Rows and columns at the
+            edges that do not fill a square are left out.
+        rounding: the relative difference that single precision may cause, which is added to the standard error.
 
     Raises:
         ImageError: the shapes differ, values are not finite, or a block is larger than the image.
@@ -157,15 +161,16 @@ def zscore_images(
     arrays = [np.asarray(array, dtype=np.float64) for array in (mean_a, variance_a, mean_b, variance_b)]
     if len({array.shape for array in arrays}) > 1 or arrays[0].ndim != 3:
         raise ImageError(
-            f"zscore_images: shapes {[a.shape for a in arrays]} must be equal, (height, width, channels)"
+            f"zscore_images: shapes {[a.shape for a in arrays]} must all be the same (height, width, channels)"
         )
     if not all(np.isfinite(array).all() for array in arrays):
         raise ImageError(
-            "zscore_images: means or variances hold NaN or infinity; look at the image for the pixel"
+            "zscore_images: means or variances have NaN or infinite pixels; correct these pixels first"
         )
     a, var_a, b, var_b = (_blocks(array, block) for array in arrays)
 
-    # Squared standard errors of the block means, and their degrees of freedom (Welch and Satterthwaite).
+    # The squared standard errors of the differences of block means, and their degrees of freedom (Welch and
+    # Satterthwaite).
     pixels = block**2
     error = var_a / (runs_a * pixels) + var_b / (runs_b * pixels)
     spread = sum(

@@ -1,7 +1,7 @@
-"""Makes Mitsuba textures from arrays, and arrays by code: worn metal, patches of lacquer, marbled pigment.
+"""Makes Mitsuba textures from arrays, and makes procedural arrays: worn metal, patches of lacquer, marbled pigment.
 
 The values are linear parameters of a material, not colours on a screen, so `bitmap_texture` loads them as raw data. The
-textures made by code tile, and a seed determines them.
+procedural textures tile, and a seed determines them.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.
         seed: another seed gives another object; equal seeds give equal values.
 
     Returns:
-        `alpha_bottom` (size, size) in 1e-3..1: a polished metal with fingerprints and scratches; `sigma_t` (size, size)
-        in 0..1: patches with soft edges where the pigmented medium is worn off; `albedo` (size, size, 3) in 0..1:
-        marbled pigments.
+        The arrays by parameter name. `alpha_bottom` (size, size), in 1e-3..1, is a polished metal with fingerprints and
+        scratches. `sigma_t` (size, size), in 0..1, has patches with soft edges where the pigmented medium is worn off.
+        `albedo` (size, size, 3), in 0..1, has marbled pigments.
 
     Raises:
         TextureError: the size is below 16.
@@ -46,13 +46,13 @@ def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.
 def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope: float = 2.0) -> Array:
     """Smooth noise that tiles: (size, size), mean 0, standard deviation 1.
 
-    It is white noise, filtered in the frequency domain: flat up to the frequency 1/period, then falling with
-    frequency^-slope. It tiles because all its frequencies are whole cycles per tile. Equal seeds give the same pattern
-    at every size.
+    White noise is filtered in the frequency domain: the amplitude is constant up to the frequency 1/period, and then
+    falls with frequency^-slope. The noise tiles because all frequencies are whole cycles per tile. Equal seeds give the
+    same pattern at every size.
 
     Args:
         period: size of the largest features, as a share of the texture.
-        slope: 1.5 is rough, 3 is smooth.
+        slope: 1.5 gives rough noise, 3 gives smooth noise.
     """
     frequency = np.fft.fftfreq(size, 1.0 / size)
     radius = np.hypot(*np.meshgrid(frequency, frequency))
@@ -63,8 +63,8 @@ def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope:
 
 
 def _low_frequencies(rng: np.random.Generator, size: int, cutoff: int = 64) -> NDArray[np.complex128]:
-    """A spectrum (size, size) of white noise up to `cutoff` cycles; at every size it has the same values up to
-    there."""
+    """A spectrum (size, size) of white noise up to `cutoff` cycles per tile. At every size, each frequency has the same
+    value."""
     block = rng.normal(size=(2, 2 * cutoff + 1, 2 * cutoff + 1))
     reach = min(cutoff, size // 2 - 1)
     inner = block[:, cutoff - reach : cutoff + reach + 1, cutoff - reach : cutoff + reach + 1]
@@ -80,7 +80,8 @@ def _smoothstep(low: float, high: float, x: Array) -> Array:
 
 
 def _worn_metal(rng: np.random.Generator, size: int) -> Array:
-    """Roughness (size, size): polished metal with fingerprints, scratches and dull clouds, made in log10(alpha)."""
+    """Microfacet widths alpha (size, size): polished metal with fingerprints, scratches and dull clouds. The patterns
+    are added in log10(alpha)."""
     clouds = periodic_noise(rng, size, period=0.35, slope=2.2)
     log_alpha = -1.35 + 0.28 * clouds
     log_alpha += 0.55 * _finger_prints(rng, size)
@@ -96,7 +97,8 @@ def _finger_prints(rng: np.random.Generator, size: int, count: int = 5) -> Array
     for _ in range(count):
         cx, cy, turn, scale = *rng.uniform(size=2), rng.uniform(0.0, np.pi), rng.uniform(0.085, 0.12)
 
-        # Distances are to the nearest copy of the centre, so that a print goes on across the border of the tile.
+        # Distances are measured to the nearest copy of the centre, so that a print continues across the border of the
+        # tile.
         dx, dy = (x - cx + 0.5) % 1.0 - 0.5, (y - cy + 0.5) % 1.0 - 0.5
         along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
         oval = np.hypot(along / 1.45, across) / scale
@@ -106,7 +108,7 @@ def _finger_prints(rng: np.random.Generator, size: int, count: int = 5) -> Array
 
 
 def _scratches(rng: np.random.Generator, size: int, count: int) -> Array:
-    """Thin straight lines (size, size) in 0..1 with tapering ends; they go on across the border of the tile."""
+    """Thin straight lines (size, size) in 0..1 with tapering ends, which continue across the border of the tile."""
     texel = 1.0 / size
     x, y = np.meshgrid((np.arange(size) + 0.5) * texel, (np.arange(size) + 0.5) * texel)
     scratches = np.zeros((size, size))
@@ -122,14 +124,15 @@ def _scratches(rng: np.random.Generator, size: int, count: int) -> Array:
 
 
 def _patches(rng: np.random.Generator, size: int) -> Array:
-    """Extinction (size, size): nearly opaque lacquer of uneven thickness, worn through in islands."""
+    """Extinction (size, size): nearly opaque lacquer of uneven thickness, with islands where the lacquer is worn
+    off."""
     wear = periodic_noise(rng, size, period=0.30, slope=2.4)
     thickness = 0.85 + 0.10 * periodic_noise(rng, size, period=0.5, slope=3.0)
     return np.clip(thickness * _smoothstep(-0.75, -0.35, wear), 0.0, 1.0)
 
 
 def _marble(rng: np.random.Generator, size: int) -> Array:
-    """Colours (size, size, 3) in bands along a warped coordinate; the bands repeat after one tile."""
+    """Colours (size, size, 3) in bands along a warped coordinate. The bands repeat after one tile."""
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
     warp = 0.16 * periodic_noise(rng, size, period=0.45, slope=3.0) + 0.03 * periodic_noise(
         rng, size, period=0.15

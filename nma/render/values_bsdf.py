@@ -1,9 +1,11 @@
-"""Mitsuba 3 BSDF `values`: renders a source with known values, such as a measurement, without an adapter.
+"""Mitsuba 3 BSDF `values`: renders a source whose BRDF values are known, such as a measurement, without an adapter.
 
-Properties: `file`, any file that `nma.sources.read` reads, and `material`, which chooses a material of a file with
-several. Or `source`, the index of a source in memory, as `bsdf_of` sets it. The BSDF may be anisotropic, is one-sided,
-and is the same everywhere on a surface. Directions are drawn from the same mixture of lobes for all materials: a cosine
-lobe and three reflections. This is unbiased but noisy, so it suits converged reference pictures.
+The property `file` names any file that `nma.sources.read` reads, and `material` chooses a material of a file with
+several materials. In place of `file`, `source` may be the index of a source in memory, which `bsdf_of` sets. The BSDF
+may be anisotropic, is one-sided, and is the same everywhere on a surface.
+
+For all materials, directions are drawn from the same mixture of a cosine lobe and three microfacet lobes. This sampling
+is unbiased but noisy, so the BSDF suits reference pictures with many samples.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.sources.base import Values
 from nma.target import Blend, Principled
 
-# Number of points of the quadrature of the albedo.
+# The number of quadrature points for the albedo.
 ALBEDO_POINTS = 256
-# Widths (alpha) of the reflection lobes from which directions are drawn.
+# The widths alpha of the microfacet lobes from which directions are drawn.
 _ALPHAS = (0.02, 0.08, 0.3)
 _WHITE = Color(1.0, 1.0, 1.0)
 
@@ -38,7 +40,7 @@ _IN_MEMORY: list[Values] = []
 
 
 def bsdf_of(source: Values) -> dict[str, Any]:
-    """The Mitsuba dictionary of a source in memory. The source is then kept until the program ends."""
+    """The Mitsuba dictionary of a source in memory. The source stays in memory until the program ends."""
     if source not in _IN_MEMORY:
         _IN_MEMORY.append(source)
     return {"type": "values", "source": _IN_MEMORY.index(source)}
@@ -78,7 +80,7 @@ def define() -> type:
             return mean_of_samples(lambda k, *u: self._draw(vec3(si.wi), u, active)[2], ALBEDO_POINTS, active)
 
         def _draw(self, wi, u, active):
-            """A direction, its density, and its value divided by the density."""
+            """A direction, its density, and the BRDF value divided by the density."""
             wo, _, _ = target.sample(_PROPOSAL, wi, *u)
             value, pdf = self._eval_pdf(wi, wo, active)
             return wo, pdf, over(value, pdf)
