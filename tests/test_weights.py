@@ -202,7 +202,7 @@ HEADERS = {
     "target of broken size": (lambda h: _target(h, size=1.0), "a wrong name or size"),
     "target in a plane of words": (
         lambda h: _target(h, in_plane="no"),
-        "cannot lie in the plane of incidence",
+        "cannot be `in_plane`",
     ),
     "target twice": (lambda h: _with(h, target=[*h["target"][:3], *h["target"][1:]]), "no name twice"),
     "target without a colour": (lambda h: _with(h, target=h["target"][1:]), "must have a base_color"),

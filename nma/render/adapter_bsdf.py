@@ -125,7 +125,7 @@ def define() -> type:
             return self._brdf(si, active, front), front
 
         def _brdf(self, si, active, front) -> Brdf:
-            """The BRDF at `si`: from the curves, from the call before this one, or else from the network."""
+            """The BRDF at `si`. It comes from the curves, from the previous call, or else from the network."""
             self.inputs.check()
             wi = Vec3(si.wi.x, si.wi.y, dr.clip(si.wi.z, MIN_COS, 1.0))
             if self._curves is not None:
@@ -163,7 +163,8 @@ class _Query(NamedTuple):
     gradients: bool  # false inside `dr.suspend_grad`
 
     def identity(self) -> list[int]:
-        """Two queries are the same if these numbers are: they have the same variables and lie in the same scope."""
+        """Numbers that are equal for two queries only if both queries have the same variables and were made in the same
+        scope."""
         from nma.jit import dr
 
         scope = dr.detail.scope(dr.backend_v(self.si.wi))
@@ -173,16 +174,17 @@ class _Query(NamedTuple):
 class _LastBrdf:
     """Keeps the BRDF of one call for the next call, so that the network runs once at a shading point.
 
-    Why: at a point, Mitsuba calls `eval_pdf` and then `sample`. It does not call `eval_pdf_sample` of BSDFs in Python.
-    Without this class, the kernel that Dr.Jit records would contain the network twice.
+    Why: at each shading point, Mitsuba calls `eval_pdf` and then `sample`, because it does not call `eval_pdf_sample`
+    of Python BSDFs. Without this class, the kernel that Dr.Jit records would contain the network twice.
 
-    What: the BRDF, whose numbers are variables of the kernel that is being recorded, and its query. The query keeps
-    its own variables alive, because Dr.Jit gives the indices of freed variables to new ones. A BRDF with derivatives
-    must not be kept: the next pass would follow them to variables that no longer exist.
+    What: the BRDF, whose numbers are variables of the kernel that is being recorded, and its query. The query keeps its
+    own variables alive, because Dr.Jit gives the indices of freed variables to new variables. A BRDF with derivatives
+    must not be kept, because the next backward pass would reach variables that no longer exist.
 
-    How long: until the next call. That call takes the BRDF if it asks the same query in the same scope, and otherwise
-    drops it. In another scope the BRDF's variables may not exist: Dr.Jit records all BSDFs of a scene with the same
-    arguments, each in a new scope. `keep` opens a new scope too, so only the code directly after it can take the BRDF.
+    How long: until the next call. That call takes the BRDF if it makes the same query in the same scope, and otherwise
+    deletes the BRDF. In another scope the BRDF's variables may not exist, because Dr.Jit records all BSDFs of a scene
+    with the same arguments, each in a new scope. `keep` opens a new scope too, so only a call directly after `keep` can
+    take the BRDF.
 
     Frozen functions do not look into this class, because they must not find variables of a kernel under recording.
     """

@@ -1,4 +1,4 @@
-"""The analytic BRDF that adapters drive: a blend of Principled BRDFs, written once for Dr.Jit, JAX and NumPy."""
+"""The analytic BRDF whose parameters the networks output: a blend of Principled BRDFs, for Dr.Jit, JAX and NumPy."""
 
 from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.brdf import Brdf

@@ -1,9 +1,10 @@
-"""Upper bounds of the directional albedo of each lobe of a Principled BRDF. They have two uses: a lobe is sampled with
-a probability in proportion to its bound, and `bounded` keeps a blend from reflecting more light than it receives.
+"""Upper bounds of the directional albedo of each lobe of a Principled BRDF. The bounds have two uses: a lobe is sampled
+with a probability in proportion to its bound, and `bounded` keeps a blend from reflecting more light than it receives.
 
-The Principled BRDF does not conserve energy. Its diffuse base is not reduced by the reflection above it, the base's
-retro-reflection alone reaches 1.5 at grazing angles, and `spec_tint` may multiply a reflectance of .13 by 13.
-tests/test_target_albedo.py checks the bounds by quadrature over the ranges of the parameters.
+The Principled BRDF does not conserve energy. Its diffuse lobe is not reduced where the specular lobe and the clearcoat
+reflect light. The retro-reflection of the diffuse lobe alone reaches 1.5 at grazing angles. For saturated colours,
+`spec_tint` may multiply a reflectance of .13 by 13. tests/test_target_albedo.py checks the bounds by quadrature over
+the ranges of the parameters.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ from nma.target.principled import (
     spec_fresnel,
 )
 
-# Added to the bounds of the diffuse and the specular lobe, so that they are sampled even where they reflect nothing.
+# Added to the bounds of the diffuse and the specular lobe, so that both lobes are sampled even where they reflect
+# nothing.
 MIN_ALBEDO = 1e-4
-# The fitted parts of the bounds are too low by at most these amounts, which are added.
+# The fitted formulas in the bounds are too low by at most these amounts, which are added to the formulas.
 SPEC_MARGIN = 0.009
 CLEARCOAT_MARGIN = 0.005
 SHEEN_MARGIN = 0.0005
-# Cosine-weighted means, over the hemisphere of wo, of its Schlick weight times cos(theta_o) to the powers 0, 1 and 2.
+# Cosine-weighted means over the hemisphere of wo: of the Schlick weight of wo, and of this weight times cos(theta_o)
+# and times cos^2(theta_o).
 _W0, _W1, _W2 = 1.0 / 21.0, 1.0 / 84.0, 1.0 / 252.0
 
 
@@ -41,9 +44,10 @@ class Albedos(NamedTuple):
 
 
 def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
-    """The bounds at cos(theta_i) > 0. They ignore `flatness` and `fade`."""
+    """The bounds of all lobes at cos(theta_i) > 0. The fields `flatness` and `fade` are ignored."""
     weight = schlick_weight(cos_theta_i)
-    # Local variables for the three bounds would make the C++ runtime copy them, which costs 2.5 ns per query.
+    # The three bounds are not stored in local variables, because the C++ runtime would copy them, which costs 2.5 ns
+    # per query.
     return Albedos(
         diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO,
         spec_albedo(p, cos_theta_i) + MIN_ALBEDO,
@@ -52,11 +56,13 @@ def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
 
 
 def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:
-    """The bound of the diffuse lobe: base and retro-reflection integrated in closed form, plus a fit to the sheen."""
+    """The bound of the diffuse lobe: the closed-form integral of base and retro-reflection, plus a fitted formula for
+    the sheen."""
     r = p.roughness
     lambert = (1.0 - 0.5 * weight) * (1.0 - 0.5 * _W0)
-    # The factor `retro` of `diffuse_terms` is r (1 + wi . wo). Below are cosine-weighted means over wo: of this factor,
-    # of the factor times the Schlick weight of wo, and of its square times that weight.
+    # The factor `retro` of `diffuse_terms` is r (1 + wi . wo). The next variables are cosine-weighted means over wo:
+    # `retro` of this factor, `retro_w` of this factor times the Schlick weight of wo, and `retro2_w` of the squared
+    # factor times that weight.
     retro = r * (1.0 + (2.0 / 3.0) * cos)
     retro_w = r * (_W0 + cos * _W1)
     sin2 = 1.0 - cos * cos
@@ -69,12 +75,13 @@ def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:
 
 
 def spec_albedo(p: Principled, cos: Float) -> Color:
-    """The bound of the specular lobe (single scattering): a bound of the masking times Fresnel at a typical facet.
+    """The bound of the specular lobe (single scattering): a bound of the masking, times the Fresnel reflectance of a
+    typical facet.
 
-    At grazing angles the visible facets of rough surfaces are tilted towards the viewer.
+    The typical facet is tilted towards the viewer, as the visible facets of rough surfaces are at grazing angles.
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    alpha = ops.minimum(alpha_x, alpha_y)  # along this axis facets tilt least
+    alpha = ops.minimum(alpha_x, alpha_y)  # facets tilt least along the axis of this width
     tilt = 0.62 * alpha / (alpha + 0.35)
     facet2 = ops.minimum(cos * cos + tilt * tilt, 1.0)
     facet = ops.sqrt(facet2)
@@ -84,11 +91,11 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
 
 
 def clearcoat_albedo(p: Principled, cos: Float, weight: Float) -> Float:
-    """The bound of the clearcoat, treated as a mirror.
+    """The bound of the clearcoat, which is treated as a mirror.
 
-    It goes to 0 at grazing angles, because the clearcoat's formula has no factor 1 / (4 cos_i cos_o).
+    The bound goes to 0 at grazing angles, because the formula of the clearcoat has no factor 1 / (4 cos_i cos_o).
     """
-    # As `masking_denominator`, with sin^2(theta_i) computed from the cosine.
+    # The formula of `masking_denominator`, with sin^2(theta_i) computed from the cosine.
     cos2 = cos * cos
     alpha2 = CLEARCOAT_MASKING_ALPHA * CLEARCOAT_MASKING_ALPHA
     masking = 2.0 * cos / (cos + ops.sqrt(cos2 + alpha2 * (1.0 - cos2)))

@@ -21,8 +21,8 @@ from nma.target.sampling import sample_clearcoat, sample_diffuse, sample_spec
 class Blend(NamedTuple):
     """Instances of the Principled BRDF, and their weights, which sum to one.
 
-    With two instances, the first weight is the paper's `blend` (eq. 3). `scale` dims the whole blend; `bounded` sets
-    it.
+    With two instances, the first weight is the paper's `blend` (eq. 3). `scale` is a factor on the value of the blend,
+    which `bounded` sets.
     """
 
     instances: tuple[Principled, ...]
@@ -39,10 +39,11 @@ class LobeProbabilities(NamedTuple):
 
 
 def bounded(blend: Blend, cos_theta_i: Float) -> Blend:
-    """The blend, dimmed where its albedo at cos(theta_i) might exceed 1: each channel is divided by its albedo's bound.
+    """The blend, dimmed if its albedo at cos(theta_i) might exceed 1: each channel is divided by the bound of its
+    albedo.
 
-    Channels whose bound is below 1 do not change. Use it only for parameters that depend on the direction: a blend of
-    constant parameters would lose its reciprocity.
+    Channels whose bound is below 1 do not change. Use this function only if the parameters of the blend depend on the
+    view direction, because a blend of constant parameters would lose its reciprocity.
     """
     total = Color(0.0, 0.0, 0.0)
     for p, weight in zip(blend.instances, blend.weights, strict=True):
@@ -84,16 +85,19 @@ def pdf(blend: Blend, wi: Vec3, wo: Vec3) -> Float:
 
 
 def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
-    """A direction `wo` from three uniform numbers in [0, 1), its value, and its density (0 for an invalid sample)."""
+    """Returns a direction `wo` drawn with three uniform numbers in [0, 1), its value, and its density (0 if `wo` is
+    invalid)."""
     view = Vec3(wi.x, wi.y, ops.select(wi.z > MIN_COS, wi.z, 1.0))
     probabilities = lobe_probabilities(blend, view.z)
-    # All diffuse lobes come first, then all specular ones, then the clearcoats.
+    # `u_lobe` selects a lobe by its interval in [0, 1): first those of all diffuse lobes, then all specular lobes, then
+    # all clearcoats.
     spec_start = sum(p.diffuse for p in probabilities)
     clearcoat_start = spec_start + sum(p.spec for p in probabilities)
     (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)
     spec_end = spec_start
     clearcoat_end = clearcoat_start
-    # Select the widths of the instance whose interval of `u_lobe` is hit: its interval follows the previous instance's.
+    # Select the widths of the instance whose interval contains `u_lobe`. The intervals are in the order of the
+    # instances.
     for p, (next_x, next_y, next_c) in zip(probabilities, others, strict=False):
         spec_end = spec_end + p.spec
         clearcoat_end = clearcoat_end + p.clearcoat
@@ -111,7 +115,8 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
 
 
 def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[LobeProbabilities, ...]:
-    """The probability of each lobe of each instance, in proportion to its bound of albedo; all of them sum to one."""
+    """The probability of each lobe of each instance: the instance's weight times the lobe's albedo bound, divided by
+    the sum."""
     albedos = [lobe_albedos(p, cos_theta_i) for p in blend.instances]
     means = [LobeProbabilities(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat) for a in albedos]
     total = sum(w * (m.diffuse + m.spec + m.clearcoat) for w, m in zip(blend.weights, means, strict=True))

@@ -1,4 +1,4 @@
-"""The analytic BRDF for a view direction: a blend and its frame. `Adapter.prepare` returns it."""
+"""The analytic BRDF that `Adapter.prepare` returns for a view direction: a blend and its frame."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from nma.target.plane import Plane
 class Brdf(NamedTuple):
     """A blend and its frame, prepared once for a view direction `wi` per lane, then evaluated and sampled.
 
-    If lobes stretch along the plane of incidence, `plane` is that plane. Otherwise `plane` is None: the blend's frame
-    is the local frame. Directions are unit vectors of the local frame. Pass the `wi` for which the BRDF was prepared.
+    If lobes stretch along the plane of incidence, `plane` is that plane. Otherwise `plane` is None, and the blend's
+    frame is the local frame. Directions are unit vectors of the local frame. The methods need the `wi` for which the
+    BRDF was prepared.
     """
 
     blend: Blend
@@ -29,11 +30,12 @@ class Brdf(NamedTuple):
         return blend.pdf(self.blend, self._enter(wi), self._enter(wo))
 
     def eval_pdf(self, wi: Vec3, wo: Vec3) -> tuple[Color, Float]:
-        """The results of `eval` and `pdf`, for the cost of one call."""
+        """The results of `eval` and `pdf`, computed together in the time of one call."""
         return blend.eval_pdf(self.blend, self._enter(wi), self._enter(wo))
 
     def sample(self, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple[Vec3, Color, Float]:
-        """A direction `wo` from three uniform numbers in [0, 1), its value and its density (0: an invalid sample)."""
+        """Returns a direction `wo` drawn with three uniform numbers in [0, 1), its value, and its density (0 if `wo` is
+        invalid)."""
         wo, value, pdf = blend.sample(self.blend, self._enter(wi), u_lobe, u1, u2)
         return (wo if self.plane is None else self.plane.leave(wo)), value, pdf
 

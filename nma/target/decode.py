@@ -18,18 +18,17 @@ from nma.target.blend import Blend
 from nma.target.principled import MIN_ALPHA, Principled
 
 Scale = Literal["linear", "log"]
-ENCODE_MARGIN = (
-    1e-6  # `encode` stays this fraction of a range away from its ends, which no finite output reaches
-)
+# `encode` keeps values this fraction of a range away from the ends of the range, which no finite output reaches.
+ENCODE_MARGIN = 1e-6
 
 
 @dataclass(frozen=True)
 class TargetParam:
     """A field of `Principled` that the network sets: its size, and the range to which raw outputs are decoded.
 
-    `in_plane` is for the field `anisotropic` of isotropic classes: the x axis of the lobes lies in the plane of
-    incidence (`nma.target.plane`). The value is multiplied by sin^2(theta_i), because there is no such plane at normal
-    incidence.
+    Only the field `anisotropic` may be `in_plane`, for isotropic classes. The x axis of the lobes then lies in the
+    plane of incidence (`nma.target.plane`), and the field is multiplied by sin^2(theta_i), because the plane of
+    incidence is not defined at normal incidence.
     """
 
     name: str
@@ -40,7 +39,7 @@ class TargetParam:
     in_plane: bool = False
 
     def decode(self, raw: Float) -> Float:
-        """Maps any real number to the range: its sigmoid, scaled linearly or logarithmically."""
+        """Maps any real number to the range by a sigmoid, which is scaled linearly or logarithmically."""
         unit = ops.sigmoid(raw)
         if self.scale == "log":
             return self.low * ops.exp(math.log(self.high / self.low) * unit)
@@ -54,8 +53,8 @@ class TargetParam:
         return logit((value - self.low) * (1.0 / (self.high - self.low)))
 
 
-# The paper's 11 parameters. The range of `specular` reaches an index of refraction of 2.1; Burley's ends at 1.8. The
-# smallest roughness follows from the smallest alpha.
+# The paper's 11 parameters. The range of `specular` reaches an index of refraction of 2.1; Burley's range ends at 1.8.
+# The smallest roughness is the square root of the smallest alpha.
 PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
     TargetParam("base_color", size=3),
     TargetParam("roughness", low=math.sqrt(MIN_ALPHA), scale="log"),
@@ -69,25 +68,26 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
 )
 
 # Isotropic materials may have lobes that are wider or narrower in the plane of incidence than a reflection's lobe, for
-# example where light is refracted twice. The width along the plane is 1/6.4 to 6.9 times the width across it.
+# example where light is refracted twice. The width of a lobe along the plane is 1/6.4 to 6.9 times its width across the
+# plane.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
-# Measured materials need three more parameters. RGL's measurements, for example, are zero where the half vector is
-# tilted by more than about 70 degrees, because the instrument does not reach there. A wide fade shapes the diffuse
-# lobe.
+# Measured materials need three more parameters. A fade is needed for RGL's measurements, for example. They are zero
+# where the half vector is tilted by more than about 70 degrees, which the instrument does not reach. A wide fade also
+# changes the shape of the diffuse lobe.
 MEASURED_PARAMS = (
     *STRETCHED_PARAMS,
     TargetParam("flatness"),
     TargetParam("fade", low=-0.3),
     TargetParam("fade_width", low=0.01, high=1.5, scale="log"),
 )
-# The same for anisotropic materials. Their lobes stretch along the x and y axes of the surface, not along the plane of
-# incidence.
+# The parameters for measured anisotropic materials, whose lobes stretch along the x and y axes of the surface, not
+# along the plane of incidence.
 ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
 # Ranges on which fields of the Principled BRDF are defined; all other fields have 0 .. 1.
 _LIMITS = {
-    "specular": (0.0, 12.0),  # no index of refraction has the reflectance of 12.5 or more
+    "specular": (0.0, 12.0),  # 12.5 gives a reflectance of 1, which no index of refraction has
     "anisotropic": (-1e6, 1.0),
     "fade": (-1.0, 1.0),
     "fade_width": (0.0, 1e6),
@@ -128,7 +128,7 @@ def _check(p: TargetParam) -> None:
     if p.name not in Principled._fields or type(p.size) is not int or p.size != size:
         raise WeightsError(f"Target parameter {p} has a wrong name or size; names are {Principled._fields}.")
     if type(p.in_plane) is not bool or (p.in_plane and p.name != "anisotropic"):
-        raise WeightsError(f"Target parameter {p} cannot lie in the plane of incidence.")
+        raise WeightsError(f"Target parameter {p} cannot be `in_plane`; only `anisotropic` can.")
     if type(p.low) not in (int, float) or type(p.high) not in (int, float):
         raise WeightsError(f"Target parameter {p} has a range whose ends are not numbers.")
     low, high = limits(p.name)
@@ -138,7 +138,8 @@ def _check(p: TargetParam) -> None:
 
 
 def limits(field: str) -> tuple[float, float]:
-    """The range on which a field of `Principled` is defined. The range of a `TargetParam` lies within it."""
+    """The range on which a field of `Principled` is defined. The range of a `TargetParam` must lie within this
+    range."""
     return _LIMITS.get(field, (0.0, 1.0))
 
 
@@ -166,8 +167,8 @@ def decode(
 ) -> Blend:
     """Converts raw network outputs, `output_size` of them, to a blend.
 
-    The weights come from breaking a stick: each instance takes a share of what is left by the instances before it, and
-    the last instance takes the rest. `cos_theta_i` is used for parameters that are `in_plane`.
+    The weights come from stick-breaking, that is, each weight is a share of what the previous weights leave of 1, and
+    the last weight is the remainder. `cos_theta_i` is used for parameters that are `in_plane`.
     """
     size = instance_size(params)
     instances = tuple(
@@ -184,7 +185,7 @@ def decode(
 
 
 def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
-    """Raw outputs that `decode` converts to nearly this blend; a fit can start from them."""
+    """Raw outputs that `decode` converts to nearly this blend. A fit can start from these outputs."""
     raw: list[Float] = []
     for p in blend.instances:
         for param in params:
@@ -200,7 +201,8 @@ def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> l
 def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
     """The blend as a flat list: all parameters, then all weights except the last.
 
-    Curves over cos(theta_i) interpolate such lists: a convex combination of them describes a valid blend again.
+    Curves over cos(theta_i) interpolate such lists, because every convex combination of such lists describes a valid
+    blend.
     """
     flat: list[Float] = []
     for p in blend.instances:
@@ -211,12 +213,12 @@ def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> 
 
 
 def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> Blend:
-    """The inverse of `numbers`. The count of instances follows from the length of the list."""
+    """The inverse of `numbers`. The number of instances follows from the length of the list."""
     size = instance_size(params)
     n = (len(flat) + 1) // (size + 1)
     if n < 1 or len(flat) != output_size(n, params):
         raise WeightsError(
-            f"{len(flat)} numbers describe no blend: it needs {size} per instance, and n - 1 weights for n instances."
+            f"{len(flat)} numbers describe no blend: n instances need {size} numbers each, and n - 1 weights."
         )
     instances = tuple(_instance(flat[k * size : (k + 1) * size], params) for k in range(n))
     weights = tuple(flat[n * size :])

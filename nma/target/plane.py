@@ -1,4 +1,4 @@
-"""The plane of incidence as a frame. Stretched lobes of isotropic materials are evaluated and sampled in this frame."""
+"""The frame of the plane of incidence, in which stretched lobes of isotropic materials are evaluated and sampled."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nma.ops import Float, Vec3
 
 
 class Plane(NamedTuple):
-    """A rotation about the normal, given by the cosine and sine of the azimuth that is turned to 0."""
+    """A rotation about the normal, given by the cosine and sine of the azimuth that the rotation maps to 0."""
 
     cos_phi: Float
     sin_phi: Float
@@ -23,9 +23,9 @@ class Plane(NamedTuple):
         return Plane(ops.select(tilted, wi.x * inverse, 1.0), ops.select(tilted, wi.y * inverse, 0.0))
 
     def enter(self, v: Vec3) -> Vec3:
-        """Turns `v` from the local frame to the frame of the plane, where `wi` has the azimuth 0."""
+        """Rotates `v` from the local frame to the frame of the plane, where `wi` has the azimuth 0."""
         return Vec3(self.cos_phi * v.x + self.sin_phi * v.y, self.cos_phi * v.y - self.sin_phi * v.x, v.z)
 
     def leave(self, v: Vec3) -> Vec3:
-        """Turns `v` from the frame of the plane to the local frame: the inverse of `enter`."""
+        """Rotates `v` from the frame of the plane to the local frame: the inverse of `enter`."""
         return Vec3(self.cos_phi * v.x - self.sin_phi * v.y, self.sin_phi * v.x + self.cos_phi * v.y, v.z)

@@ -1,18 +1,20 @@
 """One Principled BRDF (Burley 2012 and 2015): its value and the sampling densities of its lobes.
 
-Dialect "mitsuba-principled-reflection": the reflection side (spec_trans = 0) of Mitsuba 3.9's `principled`. Directions
-follow CONVENTIONS.md: local frame, z up, `wi` towards the viewer, `wo` towards the light, values are f cos(theta_o).
+The dialect "mitsuba-principled-reflection" is the reflection side (spec_trans = 0) of Mitsuba 3.9's `principled`. As
+CONVENTIONS.md says, directions are in the local frame, where z is up, `wi` points towards the viewer, and `wo` towards
+the light. Values are f cos(theta_o).
 
 Deliberate differences from Mitsuba's plugin, all of them small:
 - Narrow peaks are more precise. GGX and GTR1 are computed from the components of the half vector, never from 1 +
   (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is wrong by several per cent at alpha .001.
 - `specular` may vary over the surface, and 0 means no dielectric reflection. In Mitsuba, 0 also removes the reflection
   of metals.
-- The cosine between a direction and the half vector is |wi + wo| / 2, the same for both directions. Mitsuba takes the
-  dot product of `wi` and the half vector. Rounding makes it inaccurate where both directions are grazing and nearly
-  opposite.
-- Tints divide by max(luminance, 1e-6). For colours darker than 1e-6 they fade to black; Mitsuba switches to white at 0.
-- An instance may fade out towards grazing half vectors (`fade`), where measurements end. Mitsuba's BRDF cannot.
+- The cosine between a direction and the half vector is computed as |wi + wo| / 2, the same for both directions. Mitsuba
+  computes the dot product of `wi` and the half vector, whose rounding error is large where both directions are grazing
+  and nearly opposite.
+- Tints divide by max(luminance, 1e-6). For colours darker than 1e-6 the tints fade to black. In Mitsuba, the tint of
+  black is white.
+- An instance may fade out towards grazing half vectors (`fade`), where measurements end. Mitsuba's BRDF has no fade.
 - Directions below the horizon (there is no back side), and directions within 1e-9 of it, are invalid.
 - Lobes are sampled in proportion to their estimated albedo, with one density for the whole blend (`nma.target.blend`).
 
@@ -35,12 +37,12 @@ CLEARCOAT_F0 = 0.04
 
 
 class Principled(NamedTuple):
-    """Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine fields hold the paper's
-    11 numbers.
+    """Parameters of one Principled BRDF.
 
-    `anisotropic` stretches the specular lobe along x; `flatness` blends towards the fake subsurface of Burley 2015.
-    The whole BRDF fades out around the half vectors whose cosine to the normal is `fade`, over the width `fade_width`;
-    if both are 0, it does not fade.
+    The first nine fields hold the paper's 11 numbers, each in [0, 1] (`specular` up to 1.6). `anisotropic` stretches
+    the specular lobe along x, and `flatness` blends towards the fake subsurface of Burley 2015. The whole BRDF fades
+    out where the half vector's cosine to the normal is less than about `fade`. The fade is a smooth step of the width
+    `fade_width`. With the default values, the BRDF does not fade.
     """
 
     base_color: Color
@@ -61,7 +63,7 @@ class Principled(NamedTuple):
 class Geometry(NamedTuple):
     """Quantities of one pair of directions that all lobes of all instances share."""
 
-    valid: Mask  # both directions above the horizon
+    valid: Mask  # whether both directions are above the horizon
     wi: Vec3
     wo: Vec3
     h: Vec3  # half vector
@@ -69,7 +71,7 @@ class Geometry(NamedTuple):
     weight_i: Float  # Schlick weights of the three cosines
     weight_o: Float
     weight_d: Float
-    clearcoat: Float  # clearcoat lobe without its strength and its distribution of normals
+    clearcoat: Float  # value of the clearcoat without its strength and distribution of normals
 
 
 class Terms(NamedTuple):
@@ -105,7 +107,7 @@ def masking_denominator(v: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
 def geometry(wi: Vec3, wo: Vec3) -> Geometry:
     """The half vector, Schlick weights and the shared part of the clearcoat, for unit directions `wi` and `wo`."""
     valid = (wi.z > MIN_COS) & (wo.z > MIN_COS)
-    # Invalid pairs get the cosines 1, so that values and derivatives are always finite.
+    # In invalid pairs both cosines are set to 1, so that values and derivatives are always finite.
     i = Vec3(wi.x, wi.y, ops.select(valid, wi.z, 1.0))
     o = Vec3(wo.x, wo.y, ops.select(valid, wo.z, 1.0))
     h = i + o
@@ -143,7 +145,8 @@ def specular_eta(specular: Float) -> Float:
 
 
 def dielectric_reflectance(cos: Float, cos2: Float, eta: Float) -> Float:
-    """Unpolarised Fresnel reflectance from the side of lower index; eta >= 1, cos >= 0. Walter 2007, eq. 22."""
+    """Unpolarised Fresnel reflectance, seen from the side of lower index, for eta >= 1 and cos >= 0. Walter 2007, eq.
+    22."""
     eta2 = eta * eta
     g = ops.sqrt(ops.maximum(eta2 - 1.0 + cos2, 1e-12))
     r_s = (cos - g) / (cos + g)
@@ -152,7 +155,7 @@ def dielectric_reflectance(cos: Float, cos2: Float, eta: Float) -> Float:
 
 
 def luminance_inverse(base_color: Color) -> Float:
-    """The factor that normalises a colour to luminance 1, which leaves its tint. Burley 2012, section 5.3."""
+    """The factor that scales a colour to luminance 1, so that only its tint remains. Burley 2012, section 5.3."""
     return 1.0 / ops.maximum(ops.luminance(base_color), 1e-6)
 
 
@@ -185,11 +188,11 @@ def diffuse_terms(p: Principled, g: Geometry) -> Terms:
 def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms:
     """The Fresnel reflectance of metal, tinted dielectric and plain dielectric together.
 
-    `cos2` is cos^2, which some callers have before they take its root, and `weight` is `schlick_weight(cos)`.
+    `cos2` is cos^2, which some callers have already computed, and `weight` is `schlick_weight(cos)`.
     """
     tinted = (1.0 - p.metallic) * p.spec_tint
     plain = (1.0 - p.metallic) - tinted
-    # Schlick's F0 + (1 - F0) weight for the metal and the tinted dielectric, collected into one F0.
+    # The metal and the tinted dielectric use Schlick's F0 + (1 - F0) weight. Here f0 is the sum of both F0.
     f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
     white = (
         plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight
@@ -198,7 +201,7 @@ def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms
 
 
 def faded(p: Principled, cos_h: Float) -> Float:
-    """The share of the BRDF left where the half vector's cosine to the normal is `cos_h`: a smooth step, 1/2 at
+    """The factor of the fade, where `cos_h` is the half vector's cosine to the normal: a smooth step that is 1/2 at
     `fade`."""
     t = ops.clip((cos_h - p.fade) / ops.maximum(p.fade_width, 1e-6) + 0.5, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
@@ -209,7 +212,7 @@ def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
     # Density of directions reflected about visible normals: D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
     spec_pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
-    # The value also has the Fresnel term and the masking of `wo`, separable. Walter 2007, eq. 20.
+    # The value is this density times the masking of `wo` and the Fresnel term. Walter 2007, eq. 20.
     spec = spec_pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y))
     # Density of directions reflected about normals drawn from D cos(theta_h): D cos(theta_h) / (4 cos_d).
     clearcoat_d = gtr1_d(g.h, clearcoat_alpha(p.clearcoat_gloss))

@@ -22,8 +22,7 @@ template <class T> constexpr T SPEC_MARGIN = T(0.009);
 template <class T> constexpr T CLEARCOAT_MARGIN = T(0.005);
 template <class T> constexpr T MIN_ALBEDO = T(0.0001);
 
-// Parameters of one Principled BRDF, each in [0, 1] (`specular` up to 1.6). The first nine fields hold the paper's 11
-// numbers.
+// Parameters of one Principled BRDF.
 template <class T>
 struct Principled {
     Vec3<T> base_color;
@@ -79,7 +78,7 @@ struct Albedos {
     T clearcoat;
 };
 
-// A rotation about the normal, given by the cosine and sine of the azimuth that is turned to 0.
+// A rotation about the normal, given by the cosine and sine of the azimuth that the rotation maps to 0.
 template <class T>
 struct Plane {
     T cos_phi;
@@ -247,7 +246,7 @@ inline T specular_eta(T specular) {
     return T(2.0) / (T(1.0) - safe_sqrt(specular_f0<T>(specular))) - T(1.0);
 }
 
-// Unpolarised Fresnel reflectance from the side of lower index; eta >= 1, cos >= 0. Walter 2007, eq. 22.
+// Unpolarised Fresnel reflectance, seen from the side of lower index, for eta >= 1 and cos >= 0. Walter 2007, eq. 22.
 template <class T>
 inline T dielectric_reflectance(T cos, T cos2, T eta) {
     const auto eta2 = eta * eta;
@@ -257,7 +256,7 @@ inline T dielectric_reflectance(T cos, T cos2, T eta) {
     return T(0.5) * (r_s * r_s + r_p * r_p);
 }
 
-// The factor that normalises a colour to luminance 1, which leaves its tint. Burley 2012, section 5.3.
+// The factor that scales a colour to luminance 1, so that only its tint remains. Burley 2012, section 5.3.
 template <class T>
 inline T luminance_inverse(const Vec3<T>& base_color) {
     return T(1.0) / maximum(luminance(base_color), T(1e-06));
@@ -298,7 +297,7 @@ inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     return Terms<T>{f0 * (T(1.0) - weight), white};
 }
 
-// The share of the BRDF left where the half vector's cosine to the normal is `cos_h`: a smooth step, 1/2 at `fade`.
+// The factor of the fade, where `cos_h` is the half vector's cosine to the normal: a smooth step that is 1/2 at `fade`.
 template <class T>
 inline T faded(const Principled<T>& p, T cos_h) {
     const auto t = clip((cos_h - p.fade) / maximum(p.fade_width, T(1e-06)) + T(0.5), T(0.0), T(1.0));
@@ -322,7 +321,8 @@ inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     return Lobes<T>{p.base_color * colored + white, g.wo.z * INV_PI<T>, spec_pdf, clearcoat_pdf};
 }
 
-// The bound of the diffuse lobe: base and retro-reflection integrated in closed form, plus a fit to the sheen.
+// The bound of the diffuse lobe: the closed-form integral of base and retro-reflection, plus a fitted formula for the
+// sheen.
 template <class T>
 inline Vec3<T> diffuse_albedo(const Principled<T>& p, T cos, T weight) {
     const auto r = p.roughness;
@@ -338,7 +338,8 @@ inline Vec3<T> diffuse_albedo(const Principled<T>& p, T cos, T weight) {
     return (p.base_color * base + tint * (p.sheen * sheen)) * (T(1.0) - p.metallic);
 }
 
-// The bound of the specular lobe (single scattering): a bound of the masking times Fresnel at a typical facet.
+// The bound of the specular lobe (single scattering): a bound of the masking, times the Fresnel reflectance of a
+// typical facet.
 template <class T>
 inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
@@ -351,7 +352,7 @@ inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
     return (p.base_color * fresnel.colored + fresnel.white) * unmasked + SPEC_MARGIN<T>;
 }
 
-// The bound of the clearcoat, treated as a mirror.
+// The bound of the clearcoat, which is treated as a mirror.
 template <class T>
 inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
     const auto cos2 = cos * cos;
@@ -361,7 +362,7 @@ inline T clearcoat_albedo(const Principled<T>& p, T cos, T weight) {
     return p.clearcoat * (fresnel * cos2 * masking * masking + CLEARCOAT_MARGIN<T>);
 }
 
-// The bounds at cos(theta_i) > 0. They ignore `flatness` and `fade`.
+// The bounds of all lobes at cos(theta_i) > 0. The fields `flatness` and `fade` are ignored.
 template <class T>
 inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
     const auto weight = schlick_weight<T>(cos_theta_i);
@@ -377,13 +378,14 @@ inline Vec3<T> sample_diffuse(T u1, T u2) {
     return Vec3<T>{r * cos(phi), r * sin(phi), safe_sqrt(T(1.0) - u2)};
 }
 
-// The reflection of `wi` about a random visible GGX normal; it may point below the horizon.
+// The reflection of `wi` about a random visible GGX normal, which may point below the horizon.
 template <class T>
 inline Vec3<T> sample_spec(const Vec3<T>& wi, T alpha_x, T alpha_y, T u1, T u2) {
     return reflect<T>(wi, sample_visible_normal<T>(wi, alpha_x, alpha_y, u1, u2));
 }
 
-// The reflection of `wi` about a random normal of density GTR1 times its cosine. Burley 2012, appendix B.
+// The reflection of `wi` about a random normal, whose density is GTR1 times the cosine of the normal. Burley 2012,
+// appendix B.
 template <class T>
 inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
     const auto alpha2 = alpha * alpha;
@@ -402,13 +404,13 @@ inline Plane<T> plane_of(const Vec3<T>& wi) {
     return Plane<T>{select(tilted, wi.x * inverse, T(1.0)), select(tilted, wi.y * inverse, T(0.0))};
 }
 
-// Turns `v` from the local frame to the frame of the plane, where `wi` has the azimuth 0.
+// Rotates `v` from the local frame to the frame of the plane, where `wi` has the azimuth 0.
 template <class T>
 inline Vec3<T> plane_enter(const Plane<T>& self, const Vec3<T>& v) {
     return Vec3<T>{self.cos_phi * v.x + self.sin_phi * v.y, self.cos_phi * v.y - self.sin_phi * v.x, v.z};
 }
 
-// Turns `v` from the frame of the plane to the local frame: the inverse of `enter`.
+// Rotates `v` from the frame of the plane to the local frame: the inverse of `enter`.
 template <class T>
 inline Vec3<T> plane_leave(const Plane<T>& self, const Vec3<T>& v) {
     return Vec3<T>{self.cos_phi * v.x - self.sin_phi * v.y, self.sin_phi * v.x + self.cos_phi * v.y, v.z};
