@@ -16,7 +16,7 @@ def test_simulate_and_evaluate_print_one_json_object_and_nothing_else(nma, untra
     assert (code, out) == (0, "")
     with np.load(drawn) as one, np.load(again) as two:
         assert one["params"].shape == (2, 13)
-        for name in ("params", "table", "walks", "error"):
+        for name in ("class", "params", "table", "walks", "error"):
             np.testing.assert_array_equal(one[name], two[name])
     code, out, _ = nma("evaluate", untrained, "--reference", again, "--json")
     assert code == 0

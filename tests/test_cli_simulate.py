@@ -44,7 +44,7 @@ def test_a_damaged_part_is_simulated_again(nma, tmp_path):
     parts = tmp_path / "x.npz.parts"
     parts.mkdir()
     for key in table.stream_keys(5, range(2)):
-        (parts / f"{key:016x}-1600.npz").write_bytes(b"PK\x03\x04damaged")
+        (parts / f"layered3-{key:016x}-1600.npz").write_bytes(b"PK\x03\x04damaged")
     code, _, err = nma(*run, output)
     assert code == 0, err
     np.testing.assert_array_equal(Tables.load(output).values, Tables.load(tmp_path / "right.npz").values)

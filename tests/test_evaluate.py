@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -201,6 +202,11 @@ def test_references_that_cannot_be_compared_are_refused():
     adapter = constant(BLENDS["alpha .1"])
     with pytest.raises(TableError, match="evaluation needs isotropic tables"):
         adapters.evaluate(adapter, reference(np.zeros((1, 4, 5, 6, 3), np.float32)))
+    other = replace(reference(np.zeros((1, *ISOTROPIC.shape), np.float32)), class_name="paint")
+    with pytest.raises(
+        TableError, match="are of class paint, but the adapter is for class layered3; .*simulate"
+    ):
+        adapters.evaluate(adapter, other)
     with pytest.raises(TableError, match="no material"):
         adapters.evaluate(adapter, reference(np.zeros((0, *ISOTROPIC.shape), np.float32)))
 

@@ -274,7 +274,7 @@ def test_the_script_reproduces_the_committed_list_of_conductors(tmp_path):
     subprocess.run(
         [sys.executable, ROOT / "tools" / "make_conductors.py", out], check=True, capture_output=True
     )
-    shipped = ROOT / "nma" / "data" / "conductors.csv"
+    shipped = ROOT / "nma" / "conductors" / "conductors.csv"
     assert out.read_text() == shipped.read_text()
 
 

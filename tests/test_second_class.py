@@ -10,10 +10,13 @@ import pytest
 
 from nma import sources
 from nma.adapter import Adapter
+from nma.errors import TableError
 from nma.export import FILES
 from nma.params import LAYERED3
-from nma.table import Tables
+from nma.table import ISOTROPIC, Tables
+from nma.table.dataset import Settings
 from nma.train.recipe import CLASS, PAPER, for_class
+from nma.train.run import train_class
 
 FILE = '''
 """A stack of layers of which only two parameters vary."""
@@ -82,6 +85,43 @@ def test_simulate_takes_the_class_of_the_material(bare, nma):
     code, _, told = nma("simulate", "--material", bare, "--material", "wet-nickel", "-o", "two.npz")
     assert code == 2
     assert "classes bare, layered3" in told
+
+
+def test_files_of_tables_name_the_class(bare, nma):
+    """A command refuses tables of another class, and says what to do."""
+    assert nma("simulate", "--class", "bare", "--draw", 1, "--walks", 1600, "-o", "drawn.npz")[0] == 0
+    with np.load("drawn.npz") as arrays:
+        assert str(arrays["class"]) == "bare"
+    for command, advice in (
+        (
+            "simulate --params drawn.npz -o x.npz",
+            "drawn.npz: its materials are of class bare; add --class bare",
+        ),
+        (
+            "evaluate layered3-3x32 --reference drawn.npz",
+            "drawn.npz: the tables are of class bare, but layered3-3x32 is for class layered3; take tables of",
+        ),
+    ):
+        code, _, told = nma(*command.split())
+        assert code == 1 and advice in told and told.count("\n") == 1, told
+    assert nma(*"simulate --class bare --params drawn.npz --walks 1600 -o again.npz".split())[0] == 0
+
+
+@pytest.mark.parametrize("command", ["fit x.npz -o x.safetensors", "principled x.npz"])
+def test_tables_of_an_unknown_class_are_refused_by_name(command, nma, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Tables(np.zeros((1, 5)), np.ones((1, *ISOTROPIC.shape)), np.ones(1, int), class_name="paint").save(
+        "x.npz"
+    )
+    code, _, told = nma(*command.split())
+    assert code == 1
+    assert "x.npz: its materials are of class 'paint'; this version has layered3, measured, library" in told
+
+
+def test_training_refuses_data_of_another_class(bare):
+    data = Settings("layered3", 1, 1600, 0)
+    with pytest.raises(TableError, match="of class layered3, but the adapter is for class bare"):
+        train_class(sources.space("bare"), for_class(sources.space("bare")), data, {})
 
 
 def test_cpp_gets_the_parameters_of_the_class(bare):

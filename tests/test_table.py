@@ -5,6 +5,9 @@ seeds are fixed.
 """
 
 import math
+import sys
+import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -272,6 +275,7 @@ def test_saved_tables_come_back(tables, tmp_path):
     path = tmp_path / "new" / "folder" / "reference.npz"
     tables.save(path)
     back = Tables.load(path)
+    assert back.class_name == tables.class_name == "layered3"
     for name in ("params", "values", "walks", "error"):
         np.testing.assert_array_equal(getattr(back, name), getattr(tables, name))
         assert getattr(back, name).dtype == getattr(tables, name).dtype
@@ -314,6 +318,10 @@ def _arrays(tables, **changes):
         ({"params": np.full((2, 13), np.nan)}, "params of material 0 is not finite"),
         ({"error": np.full((2, 4, 5, 6, 3), np.inf)}, "error of material 0 is not finite"),
         ({"params": np.array([None, {}], object)}, "not a reference file"),
+        ({"class": np.array(["layered3"])}, "the entry `class` has type <U8 and shape"),
+        ({"class": 3}, "the entry `class` has type int64"),
+        ({"class": "measured"}, "params have 13 columns, but class measured has 0; simulate it again"),
+        ({"params": np.zeros((2, 5))}, "the class is not named, and no classes have 5 columns .*layered3 13"),
     ],
 )
 def test_a_malformed_reference_file_is_refused(tables, tmp_path, change, message):
@@ -367,16 +375,49 @@ def test_tables_are_joined_with_their_errors(tables):
         Tables.concatenate([tables, Tables(tables.params, tables.values, tables.walks)])
 
 
+def test_tables_of_several_classes_are_not_joined(tables):
+    with pytest.raises(TableError, match="tables of the classes layered3, paint cannot be joined"):
+        Tables.concatenate([tables, replace(tables, class_name="paint")])
+
+
+@pytest.mark.parametrize(("columns", "name"), [(13, "layered3"), (0, "measured"), (32, "library")])
+def test_a_file_without_a_class_is_of_the_only_class_with_as_many_columns(tables, tmp_path, columns, name):
+    """Earlier versions of the package wrote such files."""
+    np.savez(tmp_path / "old.npz", **_arrays(tables, params=np.full((2, columns), 0.3)))
+    found = Tables.load(tmp_path / "old.npz")
+    assert (found.class_name, found.space) == (name, sources.space(name))
+
+
+def test_a_class_is_named_where_several_have_as_many_columns(tables, tmp_path, monkeypatch):
+    twin = type("Twin", (), {"space": ParamSpace("twin", LAYERED3.params)})
+    monkeypatch.setitem(sys.modules, "nma.sources.twin", types.SimpleNamespace(Twin=twin))
+    monkeypatch.setitem(sources.CLASSES, "twin", "twin:Twin")
+    np.savez(tmp_path / "old.npz", **_arrays(tables))
+    with pytest.raises(TableError, match="old.npz: the class is not named, and 2 classes have 13 columns"):
+        Tables.load(tmp_path / "old.npz")
+    for name in ("layered3", "twin"):
+        np.savez(tmp_path / "new.npz", **_arrays(tables), **{"class": name})
+        assert Tables.load(tmp_path / "new.npz").space.name == name
+
+
+def test_tables_of_a_class_that_this_version_lacks_can_be_read(tables, tmp_path):
+    replace(tables, class_name="paint").save(tmp_path / "paint.npz")
+    found = Tables.load(tmp_path / "paint.npz")
+    assert found.class_name == "paint"
+    with pytest.raises(TableError, match="there is no class 'paint'"):
+        found.space  # noqa: B018
+
+
 def test_walks_are_counted_on_the_device_that_dr_jit_chose():
     assert dr.backend_v(dr.auto.Float) in (dr.JitBackend.LLVM, dr.JitBackend.CUDA)
 
 
 def test_some_materials_of_tables_keep_what_belongs_to_them():
     params, values = np.arange(3.0)[:, None], np.arange(6.0).reshape(3, 1, 1, 1, 2)
-    whole = Tables(params, values, np.array([5, 6, 7]), values + 1.0)
+    whole = Tables(params, values, np.array([5, 6, 7]), values + 1.0, "paint")
     for part in (whole[1:], whole[np.array([1, 2])]):
-        assert part.params.tolist() == [[1.0], [2.0]]
+        assert (part.class_name, part.params.tolist()) == ("paint", [[1.0], [2.0]])
         assert part.walks.tolist() == [6, 7]
         np.testing.assert_array_equal(part.values, values[1:])
         np.testing.assert_array_equal(part.error, values[1:] + 1.0)
-    assert Tables(params, values, np.array([5, 6, 7]))[:1].error is None
+    assert Tables(params, values, np.array([5, 6, 7]), class_name="paint")[:1].error is None

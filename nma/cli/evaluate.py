@@ -31,9 +31,11 @@ def evaluate(
     from nma.evaluate import evaluate as run
     from nma.evaluate.metrics import FIGURES
     from nma.table import Tables
+    from nma.table.grid import check_class
 
     adapter = Adapter.load(weights)
     tables = Tables.load(reference)
+    check_class(tables.class_name, adapter.space.name, weights, f"{reference}: ")
     with console.counting("evaluating", len(tables.params), "materials/s", digits=2) as show:
         result = run(adapter, tables, lambda done: show(done, done), clamp=clamp)
     if as_json:

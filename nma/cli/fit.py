@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from nma import files
 from nma.cli import console, options, reading, training
-
-if TYPE_CHECKING:
-    from nma.params import ParamSpace
-    from nma.table import Tables
 
 
 def register(app: typer.Typer) -> None:
@@ -73,29 +69,15 @@ def fit(
         learning_rate=learning_rate,
         seed=seed,
     )
-    space = _space(source, known) if isinstance(known, Tables) else None
     with console.TrainingBar(recipe) as bar:
-        if space and isinstance(known, Tables):
-            adapter, run = fit_material(space, recipe, known.params[0], known, record, progress=bar.update)
+        if isinstance(known, Tables) and known.space.size:
+            params = known.params[0]
+            adapter, run = fit_material(known.space, recipe, params, known, record, progress=bar.update)
         else:
             adapter, run = fit_one(known, recipe, record, progress=bar.update)
     training.finish(adapter, run, output)
     if not isinstance(known, Tables):
         _compare(adapter, known)
-
-
-def _space(source: str, tables: Tables) -> ParamSpace | None:
-    """The class of the table's parameters, or None if it is unknown.
-
-    A reference file does not name its class, so a class is chosen only if no other class has as many parameters.
-    """
-    from nma import materials, sources
-
-    if reading.is_material(source):
-        return materials.load(source).space
-    spaces = [sources.get(name).space for name in sources.names()]
-    fitting = [space for space in spaces if space.size == tables.params.shape[1]]
-    return fitting[0] if len(fitting) == 1 else None
 
 
 def _compare(adapter, source) -> None:

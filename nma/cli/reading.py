@@ -149,9 +149,15 @@ def _values(path: Path, material: str | None) -> tuple[Values, dict[str, Any]]:
 
 
 def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]]:
+    from nma import sources
     from nma.table import Tables
 
     tables = Tables.load(path)
+    if tables.class_name not in sources.classes():
+        raise TableError(
+            f"{path}: its materials are of class '{tables.class_name}'; this version has "
+            f"{', '.join(sources.classes())}: use the version that wrote it"
+        )
     number = _number(path, len(tables.values), material)
     chosen = tables[number : number + 1]
     record = {

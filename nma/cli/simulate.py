@@ -28,7 +28,9 @@ def simulate(
     output: Annotated[Path, options.output("The reference file to write.", ".npz")],
     params: Annotated[
         Path | None,
-        typer.Option(help="A file (.npz) with an array `params` (n, 13); reference files have one."),
+        typer.Option(
+            help="A file (.npz) with an array `params` (n, columns of the class), as reference files have."
+        ),
     ] = None,
     material: Annotated[
         list[str] | None, typer.Option(help="A named material or material file; may be repeated.")
@@ -68,7 +70,7 @@ def simulate(
 
     with console.counting("simulating", len(vectors), "Mwalks/s") as show:
         for vector, key in zip(vectors, stream_keys(seed, range(len(vectors))), strict=True):
-            part = parts / f"{key:016x}-{walks}.npz"
+            part = parts / f"{source.space.name}-{key:016x}-{walks}.npz"
             tables.append(kept(part, partial(walk, vector, key), vector[None]))
             show(len(tables), walked / 1e6)
     Tables.concatenate(tables).save(output)
@@ -92,16 +94,20 @@ def _vectors(space, params, material, draw, population, seed):
     """The parameter vectors to simulate, which the user selects by exactly one of --params, --material and --draw."""
     import numpy as np
 
+    from nma.table.grid import class_entry
+
     if (params is not None) + bool(material) + bool(draw) != 1:
         raise typer.BadParameter("give exactly one of --params, --material and --draw")
     if params is not None:
         try:
             with files.arrays(params) as f:
-                vectors = np.asarray(f["params"], np.float64)
+                vectors, named = np.asarray(f["params"], np.float64), class_entry(f)
         except Exception as e:  # also zipfile.BadZipFile, for a damaged archive
             raise TableError(
                 f"{params} is not an .npz file with an array `params` of shape (n, {space.size}): {e}"
             ) from None
+        if named and named != space.name:
+            raise TableError(f"{params}: its materials are of class {named}; add --class {named}")
         return space.check(vectors)
     if material:
         from nma import materials

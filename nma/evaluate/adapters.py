@@ -16,6 +16,7 @@ from nma.evaluate import metrics
 from nma.jit import dr
 from nma.lattice import lattice_points
 from nma.table import ISOTROPIC, Grid, Tables, quadrature
+from nma.table.grid import check_class
 from nma.table.walks import bin_index
 
 # A row of the table is a bin of cos(theta_i). The network runs at _DIRECTIONS cosines in each row. At each of these
@@ -170,9 +171,10 @@ def evaluate(
     """Compares the adapter with reference tables on the paper's grid of bins.
 
     `progress` is called with the number of materials evaluated so far. Raises `TableError` if the tables have another
-    grid, and `ParamError` for materials outside the adapter's training range. With `clamp`, the parameters of such
-    materials are moved to the end of the range instead.
+    class or another grid, and `ParamError` for materials outside the adapter's training range. With `clamp`, the
+    parameters of such materials are moved to the end of the range instead.
     """
+    check_class(reference.class_name, adapter.space.name, "the adapter")
     if reference.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
             f"evaluation needs isotropic tables of shape {ISOTROPIC.shape}, but the reference has tables of shape "

@@ -60,7 +60,7 @@ class Material:
         return {name: value for name, value in self.values.items() if isinstance(value, Texture)}
 
     def vector(self) -> NDArray[np.float64]:
-        """The parameter vector, (13,) for `layered3`. Raises `MaterialError` if a parameter has a texture."""
+        """The parameter vector (columns of the class,). Raises `MaterialError` if a parameter has a texture."""
         if self.textures:
             raise MaterialError(
                 f"material '{self.name}' has no single parameter vector: "

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from nma import sources
 from nma.errors import SourceError
 from nma.sources.base import Values
@@ -77,8 +75,8 @@ def tables(
     """The tables of the materials `chosen`, in that order.
 
     Each table is saved in `folder` once it is made, so that a killed run can go on. A later call uses a saved table
-    only if the material's file still has the same content. `params` (n, 1) of the tables are the materials' positions
-    in `chosen`. Raises `SourceError` if a file cannot be read, and `TableError` if a material is anisotropic.
+    only if the material's file still has the same content. Raises `SourceError` if a file cannot be read, and
+    `TableError` if a material is anisotropic.
     """
     digests: dict[Path, str] = {}
     made = []
@@ -88,8 +86,7 @@ def tables(
         file = Path(folder) / f"{member.name}-{digests[member.path]}.npz"
         made.append(kept(file, partial(_table, member)))
         progress(number + 1)
-    both = Tables.concatenate(made)
-    return Tables(np.arange(len(made), dtype=np.float64)[:, None], both.values, both.walks, both.error)
+    return Tables.concatenate(made)
 
 
 def _digest(path: Path) -> str:

@@ -198,7 +198,7 @@ class Dataset:
                     "delete that file and run `nma dataset` again"
                 ) from None
         walks = np.full(len(indices), ISOTROPIC.walks(self.settings.walks), np.int64)
-        return Tables(draw_params(self.settings, indices), values, walks)
+        return Tables(draw_params(self.settings, indices), values, walks, None, self.settings.class_name)
 
 
 def _create_array(path: Path, settings: Settings) -> None:

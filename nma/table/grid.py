@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.errors import OutputError, TableError
+from nma import sources
+from nma.errors import OutputError, ParamError, TableError
 from nma.files import arrays, whole
+from nma.params import ParamSpace
 
 
 @dataclass(frozen=True)
@@ -66,13 +68,20 @@ class Tables:
     """The tables of n materials.
 
     `params` (n, columns) are the materials' parameters, `values` (n, *grid.shape) their tables. `walks` (n,) are the
-    numbers of random walks. `error` has the standard error of each value, or is None.
+    numbers of random walks. `error` has the standard error of each value, or is None. `class_name` is the class of all
+    materials. If it is not given, it is the only class with as many columns. Raises `TableError` if there is no such
+    class, or more than one.
     """
 
     params: NDArray[np.float64]
     values: NDArray[np.floating]
     walks: NDArray[np.int64]
     error: NDArray[np.floating] | None = None
+    class_name: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.class_name:
+            self.class_name = _class_with(self.params.shape[-1])
 
     @property
     def grid(self) -> Grid:
@@ -87,11 +96,17 @@ class Tables:
     def __getitem__(self, chosen: slice | NDArray) -> Tables:
         """The tables of the materials that a slice, or an array of indices, chooses."""
         error = None if self.error is None else self.error[chosen]
-        return Tables(self.params[chosen], self.values[chosen], self.walks[chosen], error)
+        return Tables(self.params[chosen], self.values[chosen], self.walks[chosen], error, self.class_name)
 
     @staticmethod
     def concatenate(parts: Sequence[Tables]) -> Tables:
-        """Joins tables of several materials. Raises `TableError` if only some of them have standard errors."""
+        """Joins tables of several materials. Raises `TableError` if their classes differ, or if only some of them have
+        standard errors."""
+        classes = sorted({t.class_name for t in parts})
+        if len(classes) > 1:
+            raise TableError(
+                f"tables of the classes {', '.join(classes)} cannot be joined; join one class at a time"
+            )
         errors = [t.error for t in parts if t.error is not None]
         if errors and len(errors) < len(parts):
             raise TableError("some of the tables have standard errors, others have none")
@@ -100,11 +115,21 @@ class Tables:
             np.concatenate([t.values for t in parts]),
             np.concatenate([t.walks for t in parts]),
             np.concatenate(errors) if errors else None,
+            *classes,
         )
+
+    @property
+    def space(self) -> ParamSpace:
+        """The parameters of the class. Raises `TableError` if this version has no such class."""
+        try:
+            return sources.space(self.class_name)
+        except ParamError as e:
+            raise TableError(f"{e}; the version that made the tables has it") from None
 
     def save(self, path: str | Path) -> None:
         """Writes a reference file (its format is in CONVENTIONS.md), atomically."""
-        arrays: dict[str, Any] = {"params": self.params, "table": self.values, "walks": self.walks}
+        arrays: dict[str, Any] = {"class": self.class_name, "params": self.params}
+        arrays |= {"table": self.values, "walks": self.walks}
         if self.error is not None:
             arrays["error"] = self.error
         with whole(path) as partial, partial.open("wb") as f:
@@ -118,6 +143,7 @@ class Tables:
             with arrays(path) as f:
                 params, values, walks = f["params"], f["table"], f["walks"]
                 error = f["error"] if "error" in f else None
+                class_name = class_entry(f)
         except FileNotFoundError:
             raise TableError(f"{path}: no such file; `nma simulate` writes reference files") from None
         except (KeyError, ValueError, OSError, EOFError) as e:
@@ -128,7 +154,58 @@ class Tables:
             raise TableError(f"{path}: damaged archive: {e}") from None
         _check_arrays(path, params, values, walks, error)
         walks = np.broadcast_to(walks, len(params)).astype(np.int64)
-        return Tables(params.astype(np.float64), values, walks, error)
+        try:
+            tables = Tables(params.astype(np.float64), values, walks, error, class_name)
+            if class_name in sources.classes() and tables.space.size != params.shape[1]:
+                raise TableError(
+                    f"params have {params.shape[1]} columns, but class {class_name} has {tables.space.size}; "
+                    "simulate it again"
+                )
+        except TableError as e:
+            raise TableError(f"{path}: {e}") from None
+        return tables
+
+
+def check_class(found: str, wanted: str, reader: str, where: str = "") -> None:
+    """Raises `TableError` if tables of the class `found` are given to `reader`, which needs the class `wanted`.
+
+    `where` begins the message, for example the name of a file and a colon.
+    """
+    if found != wanted:
+        simulated = f": `nma simulate --class {wanted}`" if wanted in sources.names() else ""
+        raise TableError(
+            f"{where}the tables are of class {found}, but {reader} is for class {wanted}; take tables of class "
+            f"{wanted}{simulated}"
+        )
+
+
+def class_entry(arrays: Any) -> str:
+    """The class that an .npz file names for its `params`; empty if it names none. Raises `ValueError` for a bad entry.
+
+    Files of earlier versions name no class.
+    """
+    if "class" not in arrays:
+        return ""
+    entry = arrays["class"]
+    if entry.ndim or entry.dtype.kind != "U":
+        raise ValueError(
+            f"the entry `class` has type {entry.dtype} and shape {entry.shape}, but must be a name"
+        )
+    return str(entry)
+
+
+def _class_with(columns: int) -> str:
+    """The only class whose parameter vectors have so many columns. Raises `TableError` if there is not exactly one."""
+    sizes = {name: sources.space(name).size for name in sources.classes()}
+    fitting = [name for name, size in sizes.items() if size == columns]
+    if len(fitting) == 1:
+        return fitting[0]
+    known = ", ".join(f"{name} {size}" for name, size in sizes.items())
+    raise TableError(
+        f"the class is not named, and {len(fitting) or 'no'} classes have {columns} columns of parameters (the classes "
+        f"have: {known}); name the class (`class` in the file, `class_name` in Python), or leave out the parameters: "
+        "shape (n, 0)"
+    )
 
 
 def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | None = None) -> Tables:

@@ -17,6 +17,7 @@ from nma.errors import TableError
 from nma.jit import dr
 from nma.lattice import lattice_points
 from nma.ops import Color, Float, Vec3
+from nma.params import MEASURED
 from nma.sources.base import Values
 from nma.sources.lookup import Lookup
 from nma.table import quadrature
@@ -75,7 +76,7 @@ def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POI
                 mean[chosen], error[chosen] = _means(values, chosen, count // _SETS, crowded, grid)
     shape = (1, *grid.shape)
     walks = np.array([_equal_walks(mean, error, grid)], np.int64)
-    return Tables(np.zeros((1, 0)), mean.reshape(shape), walks, error.reshape(shape))
+    return Tables(np.zeros((1, 0)), mean.reshape(shape), walks, error.reshape(shape), MEASURED.name)
 
 
 def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:

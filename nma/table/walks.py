@@ -61,7 +61,8 @@ def tabulate(
     shape = (len(params), *grid.shape)
     if standard_error is not None:
         standard_error = standard_error.reshape(shape)
-    return Tables(params, values.reshape(shape), np.full(len(params), total, np.int64), standard_error)
+    walked = np.full(len(params), total, np.int64)
+    return Tables(params, values.reshape(shape), walked, standard_error, source.space.name)
 
 
 def stream_keys(seed: int, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.uint64]:

@@ -83,7 +83,7 @@ def _fit_table(
     if len(tables.values) != 1:
         raise TableError(f"a fit is for one material, the table has {len(tables.values)}; choose one")
     _check_isotropy("the table", not tables.grid.phi_i, recipe)
-    unnamed = Tables(tables.params[:, :0], tables.values, tables.walks)
+    unnamed = Tables(tables.params[:, :0], tables.values, tables.walks, None, MEASURED.name)
     return train_class(MEASURED, recipe, unnamed, record, progress=progress, budget_seconds=budget_seconds)
 
 

@@ -173,7 +173,7 @@ def _source(tables: Tables, recipe: Recipe) -> Callable[[int], Batch]:
 def _repeated(tables: Tables, count: int) -> Tables:
     """The tables of one material repeated `count` times, without copying them."""
     values = np.broadcast_to(tables.values, (count, *tables.values.shape[1:]))
-    return Tables(np.zeros((count, 1)), values, np.repeat(tables.walks, count))
+    return Tables(np.zeros((count, 0)), values, np.repeat(tables.walks, count))
 
 
 def _judge(codes: NDArray, library: Library, tables: Tables, recipe: Recipe) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from nma import sources, target
+from nma import target
 from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.evaluate import evaluate, tabulate_adapter
@@ -159,10 +159,8 @@ def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array,
 
 def _adapter(tables: Tables, raw: NDArray[np.float32], record: dict[str, Any]) -> Adapter:
     """An adapter whose network consists of the output layer's bias alone."""
-    size = tables.params.shape[1]
-    space = next(s for s in map(sources.space, sources.classes()) if s.size == size)
     layers = [(np.zeros((len(raw), 1), np.float32), np.asarray(raw, np.float32))]
-    return Adapter(space, "direction", layers, 1, False, CONSTANT_PARAMS, record)
+    return Adapter(tables.space, "direction", layers, 1, False, CONSTANT_PARAMS, record)
 
 
 def _plain(adapter: Adapter) -> Principled:

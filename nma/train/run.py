@@ -21,6 +21,7 @@ from nma.ops import Color
 from nma.params import ParamSpace
 from nma.table import Tables
 from nma.table.dataset import Settings
+from nma.table.grid import check_class
 from nma.target import Blend, Principled
 from nma.train import loop
 from nma.train.batches import BinSampler, Pool, Stream, draw
@@ -62,8 +63,9 @@ def train_class(
 
     `record` says where the tables come from and is stored with the weights. If `data` is settings instead of tables,
     materials are simulated during training: `data.materials` of them are in memory, and every `refresh` steps new
-    materials replace a block of them.
+    materials replace a block of them. Raises `TableError` if the data is of another class than `space`.
     """
+    check_class(data.class_name, space.name, "the adapter")
     sampler = BinSampler(recipe.bins_law, recipe.grid)
     layers = initial_layers(recipe, space)
     run = (
