@@ -72,7 +72,7 @@ def check() -> list[Finding]:
         _system(),
         _python(),
         *([_libatomic()] if sys.platform == "linux" else []),
-        _llvm(),  # precedes `_module`, because Dr.Jit looks for libLLVM when it is imported
+        _llvm(),  # before `_module`, because `_module` imports Dr.Jit, which then loads libLLVM
         *(_module(name, distribution=distribution) for name, distribution in needed.items()),
         _cuda(),
         *(_module(name, "training") for name in ("jax", "optax")),

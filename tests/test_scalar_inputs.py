@@ -233,7 +233,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
     cases = [
         ({"sigma_t": 7.0}, "sigma_t is 7, allowed is 0 .. 1, the range"),
         ({"sigma_t": math.nan}, "sigma_t is nan, allowed is 0 .. 1"),
-        ({"precision": "half"}, "precision is float32, compact or bfloat16, not 'half'"),
+        ({"precision": "half"}, "precision must be float32, compact or bfloat16, not 'half'"),
         ({"adapter": "none"}, "none: no such weights file"),
         ({"albedo": None}, "no value for albedo"),
         ({"material": "wet-nickel"}, "only vectorised variants have the property `material`"),

@@ -101,7 +101,7 @@ def _line(function: Function, node: ast.stmt) -> str:
         case ast.Return(value=ast.Call(func=ast.Name(id=structure), args=parts)):
             return _filled(f"    return {_type(structure)}{{", [_expression(function, p) for p in parts])
     raise function.unsupported(
-        node, f"a statement too long for {_WIDTH} columns of C++", "assign a part of it to a name"
+        node, f"a statement too long for {_WIDTH} columns of C++", "assign a part of the statement to a name"
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from nma.errors import ParamError
 from nma.target.principled import Principled, specular_eta
 
-# The parameters that have the same names in Mitsuba. `principled_dict` may replace `specular` by `eta`.
+# The parameters of `Principled` that have the same names in Mitsuba. `principled_dict` may replace `specular` by `eta`.
 _FIELDS = (
     *("roughness", "metallic", "specular", "spec_tint", "sheen", "sheen_tint"),
     *("clearcoat", "clearcoat_gloss", "anisotropic", "flatness"),

@@ -42,7 +42,7 @@ def shared() -> str:
 def _values(homes: tuple) -> str:
     lines = []
     for module, names in homes:
-        lines.append(f"// From {module.__name__.replace('.', '/')}.py")
+        lines.append(f"// Constants of {module.__name__.replace('.', '/')}.py")
         lines += [f"constexpr {_typed(name, getattr(module, name))};" for name in names]
     return "\n".join(lines) + "\n"
 

@@ -1,4 +1,4 @@
-"""Compiles the C++ runtime on this machine: the plugins for Mitsuba's scalar renderer, and the shared library that
+"""Compiles the C++ runtime on this machine: the plugins for Mitsuba's variant scalar_rgb, and the shared library that
 `nma.native.runtime` calls.
 
 The compiled files are kept in the user's cache, in a subfolder whose name contains a digest of the C++ sources and of
@@ -46,7 +46,7 @@ def sources() -> Path:
     for folder in (package / "cpp", package.parent.parent / "runtime"):
         if (folder / "nma.h").exists():
             return folder
-    raise NmaError(f"the C++ runtime is not beside {package}; install the package again")
+    raise NmaError(f"there are no C++ sources beside {package}; install the package again")
 
 
 def mitsuba_folder() -> Path:
@@ -70,7 +70,8 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         The folder to put on Mitsuba's resource path. The folder also contains the shipped adapters.
 
     Raises:
-        MissingDependencyError: there is no compiler, or no nanobind, whose headers Dr.Jit's headers include.
+        MissingDependencyError: there is no compiler, or the package nanobind is missing, whose headers Dr.Jit's headers
+            include.
         BuildError: the compiler failed, or this is Windows.
     """
     folder = mitsuba_folder()
@@ -119,14 +120,14 @@ def compiler() -> str:
     Windows."""
     if sys.platform == "win32":
         raise BuildError(
-            "the C++ runtime cannot be compiled on Windows, but on Linux and (untested) on macOS; use WSL, or the "
+            "the C++ runtime can be compiled on Linux and (untested) on macOS, but not on Windows; use WSL, or the "
             "variants llvm_ad_rgb and cuda_ad_rgb, which need no compiler"
         )
     for name in filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")):
         if found := shutil.which(name):
             return found
     raise MissingDependencyError(
-        "no C++ compiler found; install one (Debian: sudo apt-get install g++), or name it in CXX"
+        "no C++ compiler found; install one (Debian: sudo apt-get install g++), or set CXX to its path"
     )
 
 

@@ -47,8 +47,8 @@ class Runtime:
         adapter: the name of a shipped adapter, or a weights file.
         instruction_set: one of `INSTRUCTION_SETS`. If the CPU does not have the instruction set, "portable" replaces
             it. All instruction sets except "avx512_bf16" compute in float32.
-        compact: round the weights to bfloat16. The rounding saves time, and `runtime/README.md` gives the loss of
-            accuracy.
+        compact: round the weights to bfloat16. Rounded weights save time, and `runtime/README.md` tells how much
+            accuracy they cost.
 
     Attributes:
         parameters: the number of columns of `params`.

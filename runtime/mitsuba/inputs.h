@@ -192,7 +192,7 @@ private:
         return static_cast<int>(place);
     }
 
-    // Throws if a number of the input is not allowed. Otherwise stores the numbers in `input.value`.
+    // Checks the numbers of the input, and stores them in `input.value`. Throws if a number is not allowed.
     void accept(Input& input) const {
         const SourceParam& p = input.param;
         if (input.texture) {

@@ -122,7 +122,7 @@ private:
         auto path = resolver->resolve(name);
         if (!fs::exists(path)) path = resolver->resolve("adapters/" + name + ".safetensors");
         if (precision != "float32" && precision != "compact" && precision != "bfloat16")
-            Throw("precision is float32, compact or bfloat16, not '%s'", precision);
+            Throw("precision must be float32, compact or bfloat16, not '%s'", precision);
         nma::Options options;
         options.compact = precision != "float32";
         if (precision == "bfloat16" && nma::supported(nma::InstructionSet::avx512_bf16))

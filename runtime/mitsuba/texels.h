@@ -56,8 +56,8 @@ protected:
     }
 
 private:
-    // If `value` is an array (height, width, channels) of numbers of type T, stores its pixels and returns true.
-    // Otherwise returns false.
+    // Stores the pixels of `value` if it is an array (height, width, channels) of numbers of type T. Returns false if
+    // `value` is not such an array.
     template <class T>
     bool pixels(void* value, const std::type_info& type) {
         using Tensor = dr::Tensor<dr::DynamicArray<T>>;
@@ -67,8 +67,8 @@ private:
                       tensor.ndim() > 1 ? tensor.shape(1) : 1,
                       tensor.ndim() > 2 ? tensor.shape(2) : 1,
                       std::is_same_v<T, uint8_t>};
-        // Mitsuba stores the bytes of the image file unchanged. A lookup decodes them from sRGB, unless the texture is
-        // `raw`.
+        // Mitsuba stores the bytes of the image file unchanged. When a texture is evaluated, Mitsuba decodes the bytes
+        // from sRGB, unless the texture is `raw`.
         const bool srgb = texels.bytes && shown_->to_string().find("raw = 1") == std::string::npos;
         for (std::size_t k = 0; k < tensor.size(); ++k) {
             float x = static_cast<float>(tensor.array().entry(k));

@@ -181,9 +181,9 @@ struct Detour {
     }
 };
 
-// Returns two numbers (q, t) for light that leaves through the coat's surface: it goes up along `up` inside of the
-// coat, and along wo outside. q [1/sr] is the density of `up` if a walk from wo is refracted at a visible normal. q t
-// [1/sr] is the value of the refraction from `up` to wo, which is transmitted radiance times cos(theta_o).
+// Returns two numbers (q, t) for light that leaves through the coat's surface: the light goes up along `up` inside of
+// the coat, and along wo outside. q [1/sr] is the density of `up` if a walk from wo is refracted at a visible normal. q
+// t [1/sr] is the value of the refraction from `up` to wo, which is transmitted radiance times cos(theta_o).
 inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& wo, const Vec& up) {
     const float alpha = stack.alpha_top, eta = stack.eta_top;
     const bool matched = eta == 1.0f;
@@ -315,8 +315,8 @@ inline Vec evaluate(const Stack& stack, const Vec& wi, const Vec& wo, Random& ra
            coat_reflection(stack, wi, wo);
 }
 
-// Simulates one whole walk from `wi` (wi.z > 0). The throughput is 0 if the walk was absorbed. Otherwise `direction` is
-// the direction in which the walk left the material.
+// Simulates one whole walk from `wi` (wi.z > 0). The throughput is 0 if the walk was absorbed. If the walk left the
+// material, `direction` is the direction in which it left.
 inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
     Walk made{-wi, {1.0f, 1.0f, 1.0f}, 1.0f, false, true};
     bool left = false;

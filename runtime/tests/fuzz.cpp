@@ -1,8 +1,8 @@
 // Tests that loading damaged or random bytes as a weights file either throws an `nma::Error` or returns an adapter that
 // works.
 //
-// Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER
-//                           -Iruntime runtime/tests/fuzz.cpp -o fuzz
+// Guided by coverage:   clang++ -std=c++17 -O1 -g -fsanitize=fuzzer,address,undefined -DNMA_LIBFUZZER -Iruntime
+//                           runtime/tests/fuzz.cpp -o fuzz
 //                       ./fuzz -max_total_time=600 -max_len=4000 CORPUS
 // By chance alone:      c++ -std=c++17 -O1 -g -fsanitize=address,undefined -Iruntime runtime/tests/fuzz.cpp -o fuzz
 //                       ./fuzz COUNT WEIGHTS ...    changes bytes, words and lengths of these files, COUNT times each

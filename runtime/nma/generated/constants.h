@@ -3,26 +3,26 @@
 
 namespace nma {
 
-// From nma/target/principled.py
+// Constants of nma/target/principled.py
 constexpr const char* DIALECT = "mitsuba-principled-reflection";
-// From nma/adapter/weights.py
+// Constants of nma/adapter/weights.py
 constexpr int FORMAT = 1;
 constexpr int MAX_DEPTH = 32;
-// From nma/adapter/adapter.py
+// Constants of nma/adapter/adapter.py
 constexpr float SAME = 1e-05f;
-// From nma/params.py
+// Constants of nma/params.py
 constexpr float ROUNDING = 1e-06f;
-// From nma/adapter/encoding.py
+// Constants of nma/adapter/encoding.py
 constexpr float GRAZING = 0.1045f;
 constexpr float MIN_COS_T = 0.05f;
 
 // The constants of the simulated layered material.
 namespace layered {
 
-// From nma/sources/layered.py
+// Constants of nma/sources/layered.py
 constexpr float ROULETTE_THRESHOLD = 0.5f;
 constexpr float TRAPPED_SURVIVAL = 0.999f;
-// From nma/sources/layered_eval.py
+// Constants of nma/sources/layered_eval.py
 constexpr float INDEX_MATCHED = 0.001f;
 constexpr float LEAST_DIFFUSE = 0.03f;
 

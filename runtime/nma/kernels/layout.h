@@ -56,7 +56,7 @@ struct LayerView {
 
 struct NetworkView {
     int depth;    // count of layers
-    bool narrow;  // whether all layers are NARROW wide and have `turned`
+    bool narrow;  // whether all layers have the width NARROW, and have `turned`
     LayerView layers[DEEPEST_NETWORK];
 };
 
