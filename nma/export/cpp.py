@@ -106,7 +106,7 @@ def _line(function: Function, node: ast.stmt) -> str:
 
 
 def _filled(head: str, items: list[str]) -> str:
-    """A list in braces. Each line has as many items as fit, and starts in the column of the first item."""
+    """Prints a list in braces. Each line has as many items as fit, and starts in the column of the first item."""
     lines = [head + items[0]]
     for item in items[1:]:
         if len(lines[-1]) + len(f", {item},") <= _WIDTH:

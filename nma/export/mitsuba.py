@@ -16,8 +16,9 @@ _FIELDS = (
 # The number of significant digits that are written. Mitsuba reads numbers in single precision, which holds about 7
 # digits.
 _DIGITS = 7
-# A `specular` below _MIN_SPECULAR counts as 0, which is a dielectric without reflection. The `eta` of such a dielectric
-# is set to _MIN_ETA instead of 1, because with `eta` 1, Mitsuba 3.9 leaves out the reflection of metals, too.
+# A `specular` below _MIN_SPECULAR counts as 0 and describes a dielectric without reflection. The `eta` of such a
+# dielectric is set to _MIN_ETA instead of 1, because with `eta` 1, Mitsuba 3.9 leaves out the reflection of metals,
+# too.
 _MIN_SPECULAR, _MIN_ETA = 1e-6, 1.00001
 
 
