@@ -38,7 +38,7 @@ Row = Mapping[str, Any]  # error measures and times by name; None stands for an 
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
 OUTPUT = Path("out/bench")
 REFERENCES = ROOT / "out/bench/references"
-# Frames with more than MOST_SAMPLES samples are rendered in several passes, because one would need too much memory.
+# Frames with more than MOST_SAMPLES samples are rendered in several passes, to limit the memory.
 MOST_SAMPLES = 1 << 23
 # A converged picture is the mean of independent parts; the variance of the parts gives the noise of the mean. Numbers
 # of parts, for most scenes and for the teaser:

@@ -1,4 +1,4 @@
-"""Times per query of the C++ runtime, by instruction set, and of a large decoder, Eigen, NumPy and drjit.nn.
+"""Times per query of the C++ runtime, by instruction set, compared with Eigen, NumPy, drjit.nn and a large decoder.
 
 python -m bench.runtime [--json OUT.json]
 

@@ -157,7 +157,7 @@ def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[
 def sphere(
     bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH, hide_sun: bool = False
 ) -> dict[str, Any]:
-    """A sphere that fills the picture under sun and sky (one environment map). The material dominates the time."""
+    """A sphere that fills the picture under sun and sky (one environment map). The material takes most of the time."""
     options: dict[str, Any] = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": hide_sun}
     scene = preview_scene(bsdf, size=size, **options)
     del scene["floor"], scene["lamp"]

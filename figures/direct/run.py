@@ -4,9 +4,9 @@
 
 First trains a direct evaluator on the adapters' dataset: a decoder, and a latent code for each material (evaluator.py).
 Then fits latent codes for the 89 validation materials to the materials' own references, as the paper does for Fan et
-al. 2022. The adapters were not trained on these references: they compute the BRDF from the materials' parameters. The
-direct evaluator and the adapters are evaluated at random points in every bin, and the values are averaged over each
-bin. A killed training continues from its checkpoint in out/figures/direct.
+al. 2022. The adapters were not trained on the validation materials: they compute the BRDF from the materials'
+parameters. The direct evaluator and the adapters are evaluated at random points in every bin, and the values are
+averaged over each bin. A killed training continues from its checkpoint in out/figures/direct.
 
 Writes direct.json, direct.md and direct.png beside this file. With --quick, trains a small network and writes to
 out/figures/direct.

@@ -1,4 +1,4 @@
-"""Lobes of layered materials, fitted with one constant Principled BRDF and with a blend of two (paper Fig. 2).
+"""Lobes of layered materials, fitted with one Principled BRDF and with a blend of two Principled BRDFs (paper Fig. 2).
 
     python -m figures.lobes.run [--quick] [MATERIAL ...]
 

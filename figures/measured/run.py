@@ -1,4 +1,4 @@
-"""Fits to single materials (measured and analytic, isotropic and anisotropic), and two other models (paper Fig. 13).
+"""Fits to single materials, measured and analytic, compared with two other models (paper Fig. 13).
 
     python -m figures.measured.run [--quick] [--steps N] [--data FOLDER] [--size N] [--spp N] [MATERIAL ...]
 
@@ -243,7 +243,7 @@ def rendered(
 
 
 def flip_picture(errors: np.ndarray) -> np.ndarray:
-    """Returns a FLIP map (height, width) with values 0 .. 1 as a picture of bytes, in the colours of FLIP's authors."""
+    """Returns a FLIP map (height, width), 0 .. 1, as a picture of bytes, in the colour map of FLIP's authors."""
     return (colormaps["magma"](np.clip(errors, 0.0, 1.0))[..., :3] * 255.0).astype(np.uint8)
 
 

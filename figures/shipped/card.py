@@ -53,9 +53,9 @@ def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dic
     bound = "bounded" if adapter.bounded else "not bounded"
     return f"""# {name}
 
-`python -m figures.shipped.run` writes this page. This is an adapter for the class `{adapter.space.name}`. Its target is
-*{adapter.variant}*, whose albedo is {bound}. Its network has the size {recipe["network"]},
-{count:,} parameters, and the input encoding `{adapter.encoding}`.
+`python -m figures.shipped.run` writes this page. This is an adapter for the class `{adapter.space.name}`. The
+adapter's target is *{adapter.variant}* ([variants](../variants/README.md)), and its albedo is {bound}. The
+adapter's network has the size {recipe["network"]}, {count:,} parameters, and the input encoding `{adapter.encoding}`.
 
 ## Training
 The dataset has {data["materials"]:,} materials of the population `{data["population"]}` (seed {data["seed"]}), with

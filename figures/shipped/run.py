@@ -2,9 +2,9 @@
 
     python -m figures.shipped.run [--quick] [--adapter FILE ...]
 
-Every third of the 60 materials has a metal that was held out of training. The references have 64 M walks per material
-and fixed seeds. The references are simulated only once and stored in out/references (about 15 minutes on 2 cores; a
-killed simulation can be resumed).
+Every third of the 60 materials has a metal that was held out of training. The references have 64 M walks per material.
+They are simulated with fixed seeds, only once, and stored in out/references. The simulation takes about 15 minutes on 2
+cores; a killed simulation can be resumed.
 
 Writes shipped.json, shipped.png and a model card for each adapter beside this file. With --quick, takes few materials
 and walks, and writes to out/figures/shipped.

@@ -27,7 +27,7 @@ def statistics(values: list[float]) -> dict[str, Any]:
 
 
 def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
-    """Returns the tables' results: log losses by variant and dataset size, orderings, and image metrics by variant."""
+    """Returns the results that the tables show: log losses by variant and size, orderings, and image metrics."""
     losses: dict[str, dict[str, Any]] = {}
     for name in [*VARIANTS, *INSTANCES]:
         for size in [*sizes, 0]:
@@ -47,7 +47,7 @@ def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
 def orderings(results: Results, sizes: list[int]) -> dict[str, dict[str, list[bool]]]:
     """Returns whether `single` is worst and `blended + omega_i` is best, by metric and dataset size.
 
-    Each list has an entry for each seed with which all variants were trained.
+    The results are lists of truth values, with one value for each seed with which all variants were trained.
     """
     found: dict[str, dict[str, list[bool]]] = {}
     for size in sizes:
