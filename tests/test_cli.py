@@ -4,6 +4,7 @@ import re
 import shlex
 import subprocess
 import sys
+from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -54,13 +55,18 @@ def test_the_documentation_has_every_command_with_every_option():
     """docs/commands.md has a section for each command, which lists exactly the options of the command."""
     text = (DOCS / "commands.md").read_text()
     sections = dict(re.findall(r"^## `nma ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
-    assert set(sections) == set(COMMANDS)
+    missing, extra = (sorted(a - b) for a, b in permutations((set(COMMANDS), set(sections))))
+    assert not missing, f"docs/commands.md: add a section '## `nma {missing[0]}`' with a table of its options"
+    assert not extra, f"docs/commands.md: there is no command {extra[0]}; remove its section"
     for command, section in sections.items():
         options = {
             max(p.opts, key=len) for p in APP.commands[command].params if p.param_type_name == "option"
         }
         documented = set(re.findall(r"^\| `(--[\w-]+)", section, re.M))
-        assert documented == options - {"--help"}, command
+        assert documented == options - {"--help"}, (
+            f"docs/commands.md: the table in the section of `nma {command}` needs a row '| `--OPTION` |' for each "
+            "option of the command, and no others"
+        )
 
 
 def test_the_examples_of_the_documentation_parse():

@@ -45,9 +45,11 @@ def test_every_experiment_runs_in_its_quick_form(name, request):
 def test_committed_results_stand_beside_each_script():
     for name in EXPERIMENTS:
         home = ROOT / "figures" / name
-        assert (home / "README.md").exists(), f"{name} has no README.md"
-        assert list(home.glob("*.json")), f"{name} has no results"
-        assert list(home.glob("*.png")), f"{name} has no picture"
+        where = f"figures/{name}: "
+        assert (home / "README.md").exists(), where + "add a README.md that says what the experiment shows"
+        advice = f"run `python -m figures {name}` in full, and commit what it writes"
+        assert list(home.glob("*.json")), where + "there are no results (.json); " + advice
+        assert list(home.glob("*.png")), where + "there is no picture (.png); " + advice
 
 
 def test_the_command_without_a_name_lists_all_experiments():

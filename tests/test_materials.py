@@ -42,7 +42,8 @@ def test_no_named_material_uses_a_metal_held_out_of_training():
 
 def test_the_documentation_lists_every_named_material():
     text = (ROOT / "docs" / "materials.md").read_text()
-    assert [name for name in materials.names() if f"`{name}`" not in text] == []
+    missing = [name for name in materials.names() if f"`{name}`" not in text]
+    assert not missing, f"add {', '.join(missing)} to the list of named materials in docs/materials.md"
 
 
 def test_a_file_reads_into_the_vector_of_its_class(material_file):
