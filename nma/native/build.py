@@ -120,7 +120,7 @@ def compiler() -> str:
     Windows."""
     if sys.platform == "win32":
         raise BuildError(
-            "the C++ runtime can be compiled on Linux and (untested) on macOS, but not on Windows; use WSL, or the "
+            "the C++ runtime cannot be compiled on Windows, only on Linux and (untested) on macOS; use WSL, or the "
             "variants llvm_ad_rgb and cuda_ad_rgb, which need no compiler"
         )
     for name in filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")):
