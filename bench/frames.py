@@ -38,10 +38,10 @@ Row = Mapping[str, Any]  # error measures and times by name; None stands for an 
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
 OUTPUT = Path("out/bench")
 REFERENCES = ROOT / "out/bench/references"
-# Frames with more than MOST_SAMPLES samples are rendered in several passes, to limit the memory.
+# Frames with more than MOST_SAMPLES samples are rendered in several passes, to limit memory use.
 MOST_SAMPLES = 1 << 23
-# A converged picture is the mean of independent parts; the variance of the parts gives the noise of the mean. Numbers
-# of parts, for most scenes and for the teaser:
+# A converged picture is the mean of independent parts; the variance of the parts gives the noise of the mean.
+# PARTS is the number of parts for most scenes, TEASER_PARTS the number of parts for the teaser.
 PARTS, TEASER_PARTS = 4, 16
 # Converged pictures use seeds from REFERENCE_SEED upwards, frames use smaller seeds.
 REFERENCE_SEED = 1_000_000

@@ -63,8 +63,8 @@ def simulation(subject: Subject) -> dict[str, Any]:
 def adapter(subject: Subject, name: str, clamp: bool = False) -> dict[str, Any]:
     """Returns the BSDF `nma` of a shipped adapter or a weights file.
 
-    Without textures, the BSDF interpolates curves over the viewing angle. With textures, it runs the network at every
-    shading point.
+    Without textures, the BSDF interpolates curves over the viewing angle. With textures, the BSDF runs the network at
+    every shading point.
     """
     return material_bsdf(subject.material, "nma", adapter=name, clamp=clamp) | subject.images()
 
@@ -157,7 +157,7 @@ def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[
 def sphere(
     bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH, hide_sun: bool = False
 ) -> dict[str, Any]:
-    """A sphere that fills the picture under sun and sky (one environment map). The material takes most of the time."""
+    """A sphere that fills the picture under sun and sky (one environment map)."""
     options: dict[str, Any] = {"integrator": _path(rr_depth), "lighting": "outdoors", "hide_sun": hide_sun}
     scene = preview_scene(bsdf, size=size, **options)
     del scene["floor"], scene["lamp"]

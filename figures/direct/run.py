@@ -103,7 +103,7 @@ def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict
     kept.mkdir(parents=True, exist_ok=True)
     settings, tables = data(arguments.data, quick)
     how = direct.recipe(arguments.steps, QUICK_NETWORK if quick else NETWORK)
-    # The decoder's training does not depend on the validation set, so its file name does not name the set.
+    # The decoder's training does not depend on the validation set, so `stem` does not contain the set's name.
     stem = f"{how.network}_{settings.materials}_{how.steps}-steps"
     record: dict[str, Any] = {"dataset": asdict(settings)}
     with console.TrainingBar(how, "decoder") as bar:

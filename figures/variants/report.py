@@ -100,7 +100,7 @@ def loss_table(losses: dict[str, dict[str, Any]]) -> str:
 
 
 def ordering_lines(found: dict[str, dict[str, list[bool]]]) -> str:
-    """Returns a table of the numbers of seeds for which the paper's ordering of the variants holds."""
+    """Returns a table that counts the seeds for which the paper's ordering of the variants holds."""
     if not found:
         return "No dataset size has results of all variants yet."
     lines = [["", *next(iter(found.values()))]]
