@@ -30,8 +30,8 @@ def whole(path: str | Path) -> Iterator[Path]:
         with whole("gold.npz") as file:
             np.savez(file, ...)
 
-    The temporary file has the same suffix as `path`. Missing folders are made. If `path` exists, the new file has its
-    permissions. Raises `OutputError` if the file cannot be written.
+    The temporary file has the same suffix as `path`. Missing folders are made. If `path` exists, the new file has the
+    permissions of the old file. Raises `OutputError` if the file cannot be written.
     """
     path = Path(path)
     place = _place(path)

@@ -19,6 +19,6 @@ def lattice_steps(dimensions: int) -> tuple[float, ...]:
 def lattice_points(n: int, dimensions: int = 3) -> NDArray[np.float64]:
     """The first `n` points of the lattice, (n, 3 or 4): 0.5 + k * lattice_steps for k = 0, 1, ..., modulo 1.
 
-    Quadratures shift them by random numbers, modulo 1, which makes their estimates unbiased.
+    Quadratures shift the points by random numbers, modulo 1, which makes the estimates unbiased.
     """
     return (np.arange(n)[:, None] * np.array(lattice_steps(dimensions)) + 0.5) % 1.0

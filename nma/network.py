@@ -35,9 +35,9 @@ _BLOCK = 28
 def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | None = None) -> Layers:
     """Random layers of the given `sizes` (inputs, hidden layers, outputs), initialised as in He 2015.
 
-    A layer with as many inputs as outputs starts near the identity. This makes a deep network as easy to train as a
-    shallow one. The last layer has small weights and the bias `output_bias` (outputs,), or the bias 0 if `output_bias`
-    is None.
+    A layer with as many inputs as outputs starts near the identity, which makes a deep network as easy to train as a
+    shallow network. The last layer has small weights and the bias `output_bias` (outputs,), or the bias 0 if
+    `output_bias` is None.
     """
     layers: Layers = []
     for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
@@ -65,8 +65,8 @@ def forward_lanes(
 
     The network is unrolled into the kernel, with its weights as literals. In the virtual functions of a renderer,
     weights in memory, as in `drjit.nn`, would take ten times as long on LLVM, because they are gathered lane by lane. A
-    packet without any `active` lane skips the network and returns zeros. This saves time, because a renderer calls the
-    BSDF of a scene with only one BSDF even for rays that hit nothing.
+    packet without any `active` lane skips the network and returns zeros. The skip saves time, because a renderer calls
+    the BSDF of a scene with only one BSDF even for rays that hit nothing.
     """
     import drjit as dr
 

@@ -22,7 +22,8 @@ INV_PI = 1.0 / math.pi
 class _Python:
     """NumPy's operations on plain Python numbers, with plain Python numbers as results.
 
-    NumPy scalars would not do: in `scalar * array`, NumPy's operator would convert an array of Dr.Jit or JAX.
+    The results must not be NumPy scalars, whose operators would convert arrays of Dr.Jit and JAX, as in `scalar *
+    array`.
     """
 
     __name__ = "python"

@@ -1,4 +1,5 @@
-"""Declares the parameters of classes of materials. Training, rendering, the command line and the exports read them.
+"""Declares the parameters of classes of materials. Training, rendering, the command line and the exports read these
+declarations.
 
 This file declares `layered3` and the classes without a source. A class that is added later declares its parameters in
 the file of its source. `nma.sources.space` finds the parameters of every class.
@@ -53,7 +54,7 @@ class Bounds(NamedTuple):
         return ops.select(x >= self.low, ops.select(x <= self.high, x, self.high), self.low)
 
     def refusal(self, name: str, found: ArrayLike, kind: Range = "valid") -> str:
-        """The message for a bad number or triple `found`. A grey triple is shown as one number."""
+        """The error message for a bad number or triple `found`. A grey triple is shown as one number."""
         numbers = [f"{x:.7g}" for x in np.ravel(np.asarray(found, np.float64))]
         shown = ", ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
         return f"{name} is {shown}, allowed is {self.low:g} .. {self.high:g}{_ADVICE[kind]}"
@@ -63,10 +64,10 @@ class Bounds(NamedTuple):
 class Param:
     """One parameter of a class: a number (size 1) or an RGB triple (size 3).
 
-    `law` names the distribution from which training draws the parameter. With "log10", its logarithm is uniform. With
-    "one_minus_square", it is 1 - U^2 for a uniform U. With "conductor", it comes from real metals or from a uniform
-    distribution (CONVENTIONS.md). Adapters accept the training range, `low` to `high`. Sources accept the physically
-    meaningful range, `valid_low` to `valid_high`.
+    `law` names the distribution from which training draws the parameter. With "log10", the parameter's logarithm is
+    uniform. With "one_minus_square", the parameter is 1 - U^2 for a uniform U. With "conductor", the parameter comes
+    from real metals or from a uniform distribution (CONVENTIONS.md). Adapters accept the training range, `low` to
+    `high`. Sources accept the physically meaningful range, `valid_low` to `valid_high`.
     """
 
     name: str
@@ -156,8 +157,8 @@ class ParamSpace:
         """Returns `params` as float64 (n, size) within the bounds. Raises `ParamError`, which names the first bad
         value.
 
-        Values that exceed a bound by a rounding error are replaced by the bound. With `clamp`, this applies to all
-        values out of range. Values that are not finite always raise the error.
+        Values that exceed a bound by a rounding error are replaced by the bound. With `clamp`, all values out of range
+        are replaced by the nearest bound. Values that are not finite always raise the error.
         """
         p = np.atleast_2d(np.asarray(params, np.float64))
         if p.ndim != 2 or p.shape[1] != self.size:
@@ -208,8 +209,8 @@ class ParamSpace:
 
 
 # The largest refractive index and the largest optical depth that sources accept. With a larger index, Fresnel terms
-# overflow in single precision. In a white medium, the steps of a random walk grow with about the square of the depth,
-# so at larger depths the program would seem to hang.
+# overflow in single precision. In a white medium, the number of steps of a random walk grows with about the square of
+# the depth, so at larger depths the program would seem to hang.
 _MAX_INDEX, _MAX_DEPTH = 1e4, 1e3
 
 LAYERED3 = ParamSpace(
@@ -267,8 +268,8 @@ LAYERED3 = ParamSpace(
 # The class of materials that have no parameters, only BRDF values: measured, tabulated, or from another program's BSDF.
 MEASURED = ParamSpace("measured", ())
 
-# The class of the materials of a library (`nma.adapter.library`). Its only parameter is the learned code of a material,
-# whose single numbers have no meaning.
+# The class of the materials of a library (`nma.adapter.library`). Its only parameter is the learned code of a material.
+# The single numbers of a code have no meaning.
 CODE_BOUND = 4.0
 LIBRARY = ParamSpace(
     "library",

@@ -182,7 +182,7 @@ HEADERS = {
     ),
     "other instances": (lambda h: _with(h, instances=3), "23 outputs, but its description says .* to 35"),
     "no instances": (lambda h: _with(h, instances=0), "blend of 0 instances"),
-    "other hidden layers": (lambda h: _with(h, hidden=[32, 32, 64]), r"not the \[32, 32, 64\]"),
+    "other hidden layers": (lambda h: _with(h, hidden=[32, 32, 64]), r"not have the widths \[32, 32, 64\]"),
     "more hidden layers": (lambda h: _with(h, hidden=[32] * 4), "'layer4.weight' is missing"),
     "hidden no list": (lambda h: _with(h, hidden=None), "'hidden' of the wrong type, None"),
     "instances no number": (lambda h: _with(h, instances="two"), "'instances' of the wrong type, 'two'"),

@@ -1,4 +1,4 @@
-"""The adapter maps the parameters of a source material and `wi` to those of the analytic target (paper eq. 4)."""
+"""The adapter maps source parameters and the view direction wi to the parameters of the target (paper eq. 4)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
-# Parameters whose relative difference is smaller count as equal, because single precision may round them differently.
+# Two parameters count as equal if their relative difference is less than this, because single precision rounds them.
 SAME = 1e-5
 
 
@@ -152,9 +152,9 @@ class Adapter:
         return np.asarray(fitted, np.float64)
 
     def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
-        """Returns the parameters `params` of n materials as float64 (n, columns).
+        """Checks the parameters `params` of n materials and returns them as float64 (n, columns).
 
-        An adapter of a class accepts parameters within the training range; with `clamp`, it moves other parameters to
+        An adapter of a class accepts parameters within the training range; with `clamp`, it clamps other parameters to
         that range. An adapter of a single material accepts only the parameters of this material. Raises `ParamError`
         for parameters that are not accepted.
         """
@@ -175,7 +175,8 @@ class Adapter:
         return given
 
     def prepare(self, columns: Sequence[Float], wi: Vec3, active: Any = True) -> Brdf:
-        """The material's BRDF seen from `wi`. `columns` has one Dr.Jit or NumPy array (n,) per column of the class.
+        """The material's BRDF seen from `wi`. `columns` has one Dr.Jit or NumPy array (n,) for each column of the
+        class's parameter vector.
 
         `wi` is a unit vector of the local frame. Dr.Jit lanes that are not `active` get a meaningless BRDF.
         Raises `ParamError` for a cosine in place of `wi`.
@@ -185,7 +186,7 @@ class Adapter:
         except (AttributeError, RuntimeError):  # Dr.Jit's arrays raise RuntimeError
             raise ParamError(
                 "prepare takes the view direction wi as an nma.ops.Vec3, not a cosine; "
-                "nma.ops.at_azimuth_0(cos_theta_i) makes one"
+                "nma.ops.at_azimuth_0(cos_theta_i) converts a cosine"
             ) from None
         inputs = encoding.get(self.encoding)(columns, wi if self.directional else None)
         if ops.backend(*columns, wi.z) == "drjit":
@@ -200,8 +201,8 @@ class Adapter:
         return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
 
     def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF for the view direction `wi` from the target's parameters: `flat` has one array for each column of
-        `numbers`."""
+        """The BRDF for the view direction `wi` from the numbers that describe the target. `flat` has one array for each
+        number."""
         return self._framed(from_numbers(flat, self.target), wi)
 
     def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
@@ -222,7 +223,7 @@ class Adapter:
         return np.stack(arrays, axis=-1).reshape(len(p), len(mu), self.size).astype(np.float32)
 
     def check_isotropic(self) -> None:
-        """Raises `ParamError` if the adapter needs more of the view direction than cos(theta_i)."""
+        """Raises `ParamError` if the adapter needs the whole view direction, not only cos(theta_i)."""
         if self.anisotropic:
             raise ParamError(
                 "an anisotropic adapter has no curves over cos(theta_i), because its BRDF also depends on the azimuth "

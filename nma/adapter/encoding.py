@@ -18,9 +18,9 @@ from nma.params import LAYERED3, ParamSpace
 # Isotropic encodings use only wi.z, which is cos(theta_i).
 Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
-# Cosine of 84 degrees, near the dip of metals' reflectance before it rises to 1.
+# The cosine of 84 degrees. Near this angle, the reflectance of metals has a minimum, before it rises to 1.
 GRAZING = 0.1045
-# Where the cosine of the refracted direction is smaller than this value, this value replaces it.
+# The smallest cosine of the refracted direction that is used. Smaller cosines are replaced by this value.
 MIN_COS_T = 0.05
 
 
@@ -30,13 +30,15 @@ def raw(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
 
 
 def direction(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
-    """cos(theta_i) alone, scaled to [-1, 1], or the constant 1: the input of an adapter for one material."""
+    """The input of an adapter for one material: cos(theta_i), scaled to [-1, 1], or the constant 1 without a
+    direction."""
     return [1.0] if wi is None else [2.0 * wi.z - 1.0]
 
 
 def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """The whole direction, for one anisotropic material: wi.z, and the cosine and sine of the azimuth and of its
-    double. Factors make the cosines and sines 0 at normal incidence, where the azimuth is not defined.
+    double. The cosines and sines are multiplied by a power of sin(theta_i), so that they are 0 at normal incidence,
+    where the azimuth is not defined.
     """
     if wi is None:
         raise ParamError("the encoding 'azimuth' needs the view direction; set `directional` in the recipe")

@@ -40,7 +40,7 @@ class Library:
         shape = (len(self.names), LIBRARY.size)
         if self.adapter.space != LIBRARY or self.adapter.encoding != "raw":
             raise WeightsError(
-                f"a library needs an adapter of class {LIBRARY.name} with encoding raw; the given adapter has class "
+                f"a library needs an adapter of class {LIBRARY.name} with encoding 'raw'; the given adapter has class "
                 f"{self.adapter.space.name} and encoding {self.adapter.encoding}"
             )
         if not self.names or len(set(self.names)) < len(self.names) or self.codes.shape != shape:
@@ -83,7 +83,7 @@ class Library:
         """The code (32,) of a material. Raises `ParamError` if the library has no material of that name."""
         if name not in self.names:
             raise ParamError(
-                f"no material '{name}' among the library's {len(self.names)}; {hint(name, self.names)}"
+                f"no material '{name}' among the library's {len(self.names)} materials; {hint(name, self.names)}"
             )
         return self.codes[self.names.index(name)]
 
@@ -101,7 +101,7 @@ class Library:
 
     def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
         """The material of a code as an adapter of that one material. The result reads only cos(theta_i): what the code
-        adds to the sums of the first layer is put into the biases."""
+        contributes to the first layer is added to the biases."""
         code = LIBRARY.check(code)
         if len(code) != 1:
             raise ParamError(f"`material` takes one code; got {len(code)} codes")

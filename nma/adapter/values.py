@@ -1,4 +1,5 @@
-"""One material of an adapter as a source, so that the material can be compared and tabulated like measured ones."""
+"""One material of an adapter as a source, so that the material can be compared and tabulated like a measured
+material."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ MAX_DEPTH = 32
 class Header:
     """The metadata of a weights file.
 
-    `parameters` repeats the declaration of the class, so that programs in other languages do not need this package.
+    `parameters` declares the parameters of the class, so that programs in other languages do not need this package.
     `reciprocal` is true if the target does not depend on the view direction. `target` lists the target's parameters
     with their ranges. `dialect` names the version of the Principled BRDF. `bounded` says whether the target is dimmed
     where it might reflect more light than it receives. `training` records how the weights were made.
@@ -178,6 +178,6 @@ def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layer
         layers.append((matrix, bias))
     if [m.shape[0] for m, _ in layers[:-1]] != header.hidden:
         raise WeightsError(
-            f"{path}: its hidden layers are not the {header.hidden} of its metadata; train again"
+            f"{path}: its hidden layers do not have the widths {header.hidden} of its metadata; train again"
         )
     return layers

@@ -35,9 +35,9 @@ def define() -> type:
 
     from nma.jit import dr
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
 
-    probe = mi.Float(0.0)  # has a gradient wherever gradients are not suspended
+    probe = mi.Float(0.0)  # its gradients are enabled wherever gradients are not suspended
     dr.enable_grad(probe)
 
     class Nma(define_base()):  # type: ignore[misc]
@@ -125,7 +125,8 @@ def define() -> type:
             return self._brdf(si, active, front), front
 
         def _brdf(self, si, active, front) -> Brdf:
-            """The BRDF at `si`. It comes from the curves, from the previous call, or else from the network."""
+            """Returns the BRDF at `si`, which comes from the curves, from the previous call, or else from the
+            network."""
             self.inputs.check()
             wi = Vec3(si.wi.x, si.wi.y, dr.clip(si.wi.z, MIN_COS, 1.0))
             if self._curves is not None:
@@ -174,17 +175,18 @@ class _Query(NamedTuple):
 class _LastBrdf:
     """Keeps the BRDF of one call for the next call, so that the network runs once at a shading point.
 
-    Why: at each shading point, Mitsuba calls `eval_pdf` and then `sample`, because it does not call `eval_pdf_sample`
-    of Python BSDFs. Without this class, the kernel that Dr.Jit records would contain the network twice.
+    At each shading point, Mitsuba calls `eval_pdf` and then `sample`, because it does not call `eval_pdf_sample` of
+    Python BSDFs. Without this class, the kernel that Dr.Jit records would contain the network twice.
 
-    What: the BRDF, whose numbers are variables of the kernel that is being recorded, and its query. The query keeps its
-    own variables alive, because Dr.Jit gives the indices of freed variables to new variables. A BRDF with derivatives
-    must not be kept, because the next backward pass would reach variables that no longer exist.
+    The class keeps the BRDF, whose numbers are variables of the kernel that is being recorded, and the query that asked
+    for the BRDF. The query keeps its own variables alive, because Dr.Jit gives the indices of freed variables to new
+    variables. A BRDF with derivatives must not be kept, because the next backward pass would reach variables that no
+    longer exist.
 
-    How long: until the next call. That call takes the BRDF if it makes the same query in the same scope, and otherwise
-    deletes the BRDF. In another scope the BRDF's variables may not exist, because Dr.Jit records all BSDFs of a scene
-    with the same arguments, each in a new scope. `keep` opens a new scope too, so only a call directly after `keep` can
-    take the BRDF.
+    The next call takes the BRDF if that call makes the same query in the same scope, and otherwise deletes the BRDF. In
+    another scope the BRDF's variables may not exist, because Dr.Jit records all BSDFs of a scene with the same
+    arguments, each in a new scope. `keep` opens a new scope too, so only a call directly after `keep` can take the
+    BRDF.
 
     Frozen functions do not look into this class, because they must not find variables of a kernel under recording.
     """

@@ -18,7 +18,7 @@ _HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
 def define_base() -> type:
     """The base class of all our BSDFs, for Mitsuba's current variant.
 
-    A subclass defines `eval_pdf`, `sample` and `_albedo`. If it has `inputs` (`nma.render.inputs.Inputs`),
+    A subclass defines `eval_pdf`, `sample` and `_albedo`. If a subclass has `inputs` (`nma.render.inputs.Inputs`),
     `mi.traverse` and attributes list these inputs, and `differentiable` says whether the inputs have derivatives. A
     subclass calls this `__init__` last, after everything that can fail, because this `__init__` registers the BSDF in
     Dr.Jit. Dr.Jit calls a registered BSDF in all scenes until the BSDF is destroyed, and a traceback could keep a BSDF
@@ -28,7 +28,7 @@ def define_base() -> type:
 
     from nma.jit import dr
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
 
     class OneSided(mi.BSDF):
         inputs: Any = None
@@ -67,7 +67,8 @@ def define_base() -> type:
             return *self.eval_pdf(ctx, si, wo, active), *self.sample(ctx, si, sample1, sample2, active)
 
         def eval_diffuse_reflectance(self, si, active=True):
-            """The directional albedo at wi, at most 1. Denoisers and `aov` use it as the colour of the surface."""
+            """The directional albedo at wi, at most 1. Denoisers and `aov` use this albedo as the colour of the
+            surface."""
             front = mi.Bool(active) & (si.wi.z > 0)
             albedo = self._albedo(si, front)
             return mi.Color3f(*(minimum(c, 1.0) for c in albedo)) & front
@@ -178,7 +179,7 @@ def _registered() -> list[Any]:
     import mitsuba
 
     dr: Any = drjit
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
     found: list[Any] = []
     for number in count(1):
         try:
@@ -206,7 +207,7 @@ def _parts(bsdf: Any) -> list[Any]:
     """
     import mitsuba
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
     found: list[Any] = []
 
     class Parts(mi.TraversalCallback):

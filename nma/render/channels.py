@@ -19,11 +19,12 @@ _RGBA = [letter.upper() for letter in CHANNELS]
 
 
 def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
-    """The names of the `count` channels of a scene's rendered picture; all names differ. Render the scene first.
+    """The names of the `count` channels of a scene's rendered picture; all names differ. The scene must have been
+    rendered.
 
-    The film lists its own colours first, then all channels of the integrator. The integrator `aov` announces each
-    nested integrator as RGBA, but writes it in the film's format, and the first nested integrator takes the place of
-    the film's colours.
+    The film lists its own colours first, then all channels of the integrator. The integrator `aov` declares four RGBA
+    channels for each nested integrator, but writes the channels of the film's format. The channels of the first nested
+    integrator replace the film's own colours.
     """
     announced = list(scene.integrator().aov_names())
     film = [channel.name for channel in scene.sensors()[sensor].film().bitmap().struct_()]
@@ -42,8 +43,8 @@ def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
 def colours(image: NDArray[np.float32], names: list[str]) -> NDArray[np.float32]:
     """The colours of a picture, as linear sRGB (height, width, 3).
 
-    If `names` says that the first three channels are RGB or XYZ, they are returned as RGB. Otherwise the first channel
-    is returned as grey.
+    If `names` says that the first three channels are RGB or XYZ, these channels are returned as RGB. Otherwise the
+    first channel is returned as grey.
     """
     if names[:3] == _RGBA[:3]:
         return image[..., :3]

@@ -12,9 +12,9 @@ from nma.ops import Float, Vec3, at_azimuth_0
 from nma.target.brdf import Brdf
 from nma.target.decode import numbers
 
-# How many cosines have a node. For random materials in the training range, the curves changed BRDF values by 1e-4 on
-# average, at directions sampled from the blend, and albedos by 1e-5. Nodes that lie closer at grazing angles gave about
-# the same errors.
+# The number of nodes, that is, of cosines for which the blend is stored. For random materials in the training range,
+# the curves changed BRDF values by 1e-4 on average, at directions sampled from the blend, and albedos by 1e-5. Nodes
+# that lie closer at grazing angles gave about the same errors.
 NODES = 128
 # How many numbers one gather fetches. Dr.Jit can fetch a power of two at once, so 24 numbers take three gathers of 8.
 PACKET = 8
@@ -31,7 +31,7 @@ class Curves:
     computation of the curves.
     """
 
-    # Frozen functions of Dr.Jit look for variables here.
+    # Frozen functions of Dr.Jit look for variables in these fields.
     DRJIT_STRUCT = {"table": object, "slopes": dict, "layers": list}  # noqa: RUF012
 
     def __init__(self, adapter: Adapter, columns: Sequence[Float], nodes: int = NODES):
@@ -39,7 +39,7 @@ class Curves:
         Args:
             adapter: the adapter whose network computes the curves.
             columns: `mi.Float` of width 1 for each column of the class's parameter vector.
-            nodes: number of cosines; two are used if the target does not depend on the direction.
+            nodes: number of nodes; two nodes are used if the target does not depend on the direction.
 
         Raises `ParamError` for anisotropic adapters.
         """
@@ -65,7 +65,7 @@ class Curves:
         flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
-                change = columns[k] - dr.detach(columns[k])  # 0, but with the derivative of the column
+                change = columns[k] - dr.detach(columns[k])  # 0, with the derivative of columns[k]
                 steps = self._looked_up(slope, wi.z, active)
                 flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
         return self.adapter.from_numbers(flat, wi)

@@ -24,7 +24,7 @@ from nma.render.textures import bitmap_texture, procedural_textures
 HEADINGS = ("material", "BSDF", "time", "compile", "variance", "HDR-FLIP", "SMAPE", "efficiency")
 DEPTH = 6
 TEXTURE_SCALE = 2.0
-STAND_IN_RUNS = 2  # how often `principled` is rendered, of which only the time is reported
+STAND_IN_RUNS = 2  # how often `principled` is rendered; only its time is reported
 FIRST_SPP = 16  # samples per pixel of the first pictures, which come before the measurements
 # FLIP errors of this value or more are shown in the brightest colour of the difference picture.
 FLIP_SCALE = 0.5
@@ -60,7 +60,7 @@ class Scene(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A picture (height, width, 3), and the seconds that it took, compilation included."""
+    """A picture (height, width, 3), and the seconds for which it was rendered, including compilation."""
 
     image: NDArray[np.float64]
     seconds: float
@@ -136,7 +136,7 @@ def total_samples(settings: Settings) -> int:
 
 
 def note(settings: Settings) -> str:
-    """The text under the table, which explains its columns and names the machine on which they were measured."""
+    """The text under the table, which explains the table's columns and names the machine of the measurements."""
     import mitsuba as mi
 
     width, height = settings.size

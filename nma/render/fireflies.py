@@ -21,7 +21,7 @@ def clamped(integrator: Any, limit: float) -> Any:
 
     from nma.jit import dr
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         raise ParamError(
             "samples can be clamped only if each sample is one path; use the integrator path, volpath or direct"

@@ -32,7 +32,7 @@ class Inputs:
     share a kernel.
     """
 
-    # Frozen functions of Dr.Jit look for variables here.
+    # Frozen functions of Dr.Jit look for variables in these fields.
     DRJIT_STRUCT = {"values": dict}  # noqa: RUF012
 
     def __init__(self, space: ParamSpace, props: Any, bounds: Range = "valid", clamp: bool = False):
@@ -62,7 +62,7 @@ class Inputs:
     def columns(self, si: Any = None, active: Any = True) -> list[Any]:
         """One `mi.Float` for each column of the class's parameter vector, at the surface interaction `si`.
 
-        Without textures `si` is not needed. Gradients reach numbers, colours and textures.
+        Without textures `si` is not needed. Derivatives are propagated to numbers, colours and textures.
         """
         return [channel for param in self.space.params for channel in self.channels(param.name, si, active)]
 
@@ -110,8 +110,8 @@ class Inputs:
             raise fault
 
     def _fault(self, param: Param) -> ParamError | TextureError | None:
-        """The error of an input if its value has changed to a bad one, else None. A bad value is replaced by the last
-        good value."""
+        """The error of an input if its value has changed and is not allowed, else None. A bad value is replaced by the
+        last good value."""
         import mitsuba as mi
 
         seen, value = self._seen[param.name], self.values[param.name]
@@ -136,7 +136,7 @@ class Inputs:
 
         for value in self.values.values():
             if not isinstance(value, mi.Texture):
-                dr.make_opaque(value)  # literals, which Mitsuba sets, would be compiled into the kernel
+                dr.make_opaque(value)  # Mitsuba sets literals, which would be compiled into the kernel
         self.check(numbers=True)
 
 
@@ -199,7 +199,7 @@ class _Seen:
         """Restores the arrays that were checked last, if there are any."""
         import mitsuba
 
-        mi: Any = mitsuba  # its type stubs lack this function
+        mi: Any = mitsuba  # Mitsuba's type stubs lack this function
         if self._checked is None:
             return
         if self._number is not None:
@@ -307,7 +307,7 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     """The parameters of a named material. Textures of the material are converted to Mitsuba textures."""
     import mitsuba
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
 
     # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
     found = mi.file_resolver().resolve(name) if name.endswith(".toml") else name

@@ -7,8 +7,8 @@ and `pdf` and `sample` report the same density.
 
 `sample` simulates one random walk. BSDFs that blend others (`blendbsdf`, `mask`) assume that weight times pdf is the
 value of f, which is wrong for a walk. Inside such a BSDF, `sample` draws a direction from `pdf`, and its weight is an
-estimate of the value divided by `pdf`. This method is unbiased in every BSDF, but it is slower and has 1 to 1.4 times
-the variance of a walk.
+estimate of the value divided by `pdf`. Drawing from `pdf` is unbiased in every BSDF, but slower than a walk, and has 1
+to 1.4 times the variance of a walk.
 
 `nma.render.inputs` reads the parameters of class `layered3`. The BSDF is one-sided; wrap it in `twosided` if needed.
 """
@@ -25,8 +25,8 @@ from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3, Stack
 
-# The albedo at a point is the mean of this many walks. Their random numbers are the same at all points, so the albedo
-# has no noise, but an error of up to .06.
+# The albedo at a point is the mean of this many walks. The walks have the same random numbers at all points, so the
+# albedo has no noise, but an error of up to .06.
 ALBEDO_WALKS = 128
 
 
@@ -36,7 +36,7 @@ def define() -> type:
 
     from nma.jit import dr
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
 
     source = Layered3()
 
@@ -84,7 +84,7 @@ def define() -> type:
             return mi.Vector3f(*wo), mi.Color3f(*throughput)
 
         def _draw(self, stack, si, u, active):
-            """A direction drawn from `pdf`, and an estimate of its value divided by `pdf`."""
+            """A direction drawn from `pdf`, and an estimate of the BRDF value for this direction divided by `pdf`."""
             wo = mi.Vector3f(*layered_eval.sample(stack, vec3(si.wi), *u))
             value, pdf = self._estimate(stack, si, wo, active)
             return wo, over(value, pdf)
@@ -114,7 +114,7 @@ def define() -> type:
             a, b = (a ^ x, b) if i % 2 == 0 else (a, b ^ x)
             if i % 2 == 1 or i == len(bits) - 1:
                 a, b = mi.sample_tea_32(a, b)
-        rng = mi.PCG32()  # the seeding of its constructor would also depend on the lane
+        rng = mi.PCG32()  # the constructor's own seeding would also depend on the lane
         rng.state, rng.inc = (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(b) << 1) | 1
         return rng
 

@@ -35,8 +35,8 @@ LAMP_POSITION, LAMP_SIZE, LAMP_RADIANCE = (2.6, -2.4, 3.6), 0.17, (46.0, 42.0, 3
 class Softbox(NamedTuple):
     """A rectangular light at infinite distance.
 
-    `towards`: direction of its middle. `half`: half its width and half its height, as angles seen from the ball
-    [degrees]. `edge`: width of its soft edge [degrees]. `turn`: rotation about the line of sight [degrees].
+    `towards`: direction of the rectangle's middle. `half`: half the width and half the height, as angles seen from the
+    ball [degrees]. `edge`: width of the soft edge [degrees]. `turn`: rotation about the line of sight [degrees].
     `radiance`: linear sRGB.
     """
 
@@ -47,8 +47,8 @@ class Softbox(NamedTuple):
     radiance: Colour
 
     def coverage(self, direction: Array) -> Array:
-        """The share (...) of the light's radiance in directions (..., 3): 1 inside the rectangle, 0 outside, smooth
-        between."""
+        """The share of the light's radiance in each of the directions (..., 3): 1 inside the rectangle, 0 outside, and
+        smooth between."""
         middle = np.array(self.towards) / np.linalg.norm(self.towards)
         right = np.cross(middle, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
@@ -65,8 +65,8 @@ class Softbox(NamedTuple):
 
 
 SOFTBOXES = (
-    # The main light, on the left: two panes with a bar between them. It has most of the power, so that most light
-    # samples go to it. Samples of another light are wasted at all points that this other light does not reach.
+    # The main light, on the left: two panes with a bar between them. This light has most of the power, so that most
+    # light samples go to it. Samples of another light are wasted at all points that this other light does not reach.
     Softbox((-0.93, -0.42, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
     Softbox((-0.70, -0.72, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
     Softbox((0.92, -0.15, 0.42), (1.8, 28.0), 1.0, 8.0, (11.8, 12.5, 13.7)),  # a strip on the right
@@ -181,7 +181,7 @@ def smoothstep(x: Array) -> Array:
 
 def _read_only(radiance: Array) -> NDArray[np.float32]:
     made = radiance.astype(np.float32)
-    made.flags.writeable = False  # callers share the cached array
+    made.flags.writeable = False  # because callers share the cached array
     return made
 
 

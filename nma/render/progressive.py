@@ -91,7 +91,8 @@ def sampler(spp: int, pixels: int) -> str:
 
 
 def _fills_grid(samples: int) -> bool:
-    """Whether Mitsuba's multi-jittered sampler takes exactly this number of samples. It rounds other numbers up."""
+    """Whether Mitsuba's multi-jittered sampler takes exactly this number of samples. The sampler rounds other numbers
+    up."""
     return samples % max(math.isqrt(samples), 1) == 0
 
 

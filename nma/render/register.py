@@ -21,7 +21,8 @@ _registered = False
 
 
 def register() -> None:
-    """Registers the plugins now, if a variant is set, and again after every `mi.set_variant`. Further calls do nothing.
+    """Registers the plugins now, if a variant is set, and again after every `mi.set_variant`. Further calls of this
+    function do nothing.
 
     Mitsuba stores Python plugins separately for each variant. scalar_rgb and the `mitsuba` executable need compiled
     plugins, which `nma mitsuba build` compiles.
@@ -62,7 +63,7 @@ def _add_resource(folder: str) -> None:
     """Adds a folder to Mitsuba's resource path, unless the path already has the folder."""
     import mitsuba
 
-    mi: Any = mitsuba  # its type stubs lack this function
+    mi: Any = mitsuba  # Mitsuba's type stubs lack this function
     resources = mi.file_resolver()
     if folder not in [str(path) for path in resources]:
         resources.append(folder)

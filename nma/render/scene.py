@@ -74,14 +74,16 @@ def preview_scene(
         spp: samples per pixel that `mi.render(scene)` takes by default.
         max_depth: the largest number of edges of a path, as Mitsuba counts them (1 shows only emitters).
         camera: a name in `CAMERAS`, a `Camera`, or None for "hero".
-        envmap: an EXR or HDR file, latitude-longitude, y up in the file. It replaces all other light.
+        envmap: an EXR or HDR file, latitude-longitude, y up in the file. This map replaces all other light.
         envmap_scale: factor on the environment map's radiance.
         lighting: "studio" (softboxes in a dim dome) or "outdoors" (sun, sky and a small lamp).
-        mesh: a PLY or OBJ file to show in place of the shader ball, moved to its place and scaled to its size.
+        mesh: a PLY or OBJ file to show in place of the shader ball, moved to the ball's place and scaled to the ball's
+            size.
         mesh_up: the axis of the mesh file that points up, "z" or "y".
         integrator: "path", "prb", the name of another Mitsuba integrator that takes `max_depth`, or the dictionary of
             an integrator.
-        hide_sun: whether to leave out the disc of the sun, but not the sky and the lamp. For "outdoors" only.
+        hide_sun: whether to leave out the disc of the sun, but not the sky and the lamp. This option is for "outdoors"
+            only.
         rfilter: reconstruction filter of the film. "box" keeps pixels statistically independent.
         sampler: name of a Mitsuba sampler. "multijitter" leaves less noise, but takes only certain sample counts; see
             `nma.render.progressive.sampler`.
@@ -144,7 +146,7 @@ def material_mask(
     middle = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, middle, mi.Point2f(0.5))
 
-    # The pointer of the shape that a ray hits is the ball's pointer or the floor's pointer.
+    # Rays that hit the ball are found by the pointer of the shape that they hit.
     ball = next(shape for shape in scene.shapes() if shape.id() == "ball")
     return np.array(scene.ray_intersect(ray).shape == mi.ShapePtr(ball)).reshape(height, width)
 

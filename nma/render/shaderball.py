@@ -26,7 +26,7 @@ SHELL_CENTRE = np.array([0.0, 0.0, 1.12])
 SHELL_AXIS = np.array([0.56, -0.66, 0.50])  # from the shell's centre to the middle of its opening
 SHELL_OPENING = np.radians(52.0)  # angle between SHELL_AXIS and the top of the lip around the opening
 LIP_RADIUS = 0.07
-CAVITY_OFFSET = 0.16  # distance along SHELL_AXIS from the shell's centre to that of the cavity's sphere
+CAVITY_OFFSET = 0.16  # from the shell's centre to the centre of the cavity's sphere, along SHELL_AXIS
 GROOVE_ANGLE = np.radians(76.0)
 GROOVE_HALF_WIDTH = np.radians(3.6)
 GROOVE_DEPTH = 0.055
@@ -74,7 +74,7 @@ def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int
         profile: (n, 2) points (radius, height) that lie close together. The outside of the surface is to the left of
             the direction from each point to the next.
         turns: number of segments around the axis.
-        steps: number of segments along the profile. They are shorter where the profile turns.
+        steps: number of segments along the profile. Segments are shorter where the profile turns.
         axis: direction of the axis of revolution, of any length.
         repeats: how often u runs from 0 to 1 in one turn. v is scaled so that textures are not stretched at the largest
             radius.

@@ -83,7 +83,7 @@ def measure(
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if len(numbers) < 2 or len(set(numbers)) < len(numbers):
         raise ParamError(
-            f"measure: at least two seeds are needed, all different, got {numbers}; pass such seeds, or a number"
+            f"measure: pass at least two seeds, all different, or how many seeds to take; got {numbers}"
         )
     first = 0.0
     if warmup:

@@ -63,8 +63,8 @@ def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope:
 
 
 def _low_frequencies(rng: np.random.Generator, size: int, cutoff: int = 64) -> NDArray[np.complex128]:
-    """A spectrum (size, size) of white noise up to `cutoff` cycles per tile. At every size, each frequency has the same
-    value."""
+    """A spectrum (size, size) of white noise up to `cutoff` cycles per tile. The value at each frequency is the same
+    for every size."""
     block = rng.normal(size=(2, 2 * cutoff + 1, 2 * cutoff + 1))
     reach = min(cutoff, size // 2 - 1)
     inner = block[:, cutoff - reach : cutoff + reach + 1, cutoff - reach : cutoff + reach + 1]

@@ -50,7 +50,7 @@ def define() -> type:
     """The plugin's class for Mitsuba's current variant."""
     import mitsuba
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Mitsuba's types change with the variant
 
     class ValuesBsdf(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:

@@ -1,7 +1,7 @@
 """Upper bounds of the directional albedo of each lobe of a Principled BRDF. The bounds have two uses: a lobe is sampled
 with a probability in proportion to its bound, and `bounded` keeps a blend from reflecting more light than it receives.
 
-The Principled BRDF does not conserve energy. Its diffuse lobe is not reduced where the specular lobe and the clearcoat
+The Principled BRDF does not conserve energy. The diffuse lobe is not reduced where the specular lobe and the clearcoat
 reflect light. The retro-reflection of the diffuse lobe alone reaches 1.5 at grazing angles. For saturated colours,
 `spec_tint` may multiply a reflectance of .13 by 13. tests/test_target_albedo.py checks the bounds by quadrature over
 the ranges of the parameters.
@@ -23,8 +23,8 @@ from nma.target.principled import (
     spec_fresnel,
 )
 
-# Added to the bounds of the diffuse and the specular lobe, so that both lobes are sampled even where they reflect
-# nothing.
+# This value is added to the bounds of the diffuse and the specular lobe, so that both lobes are sampled even where they
+# reflect nothing.
 MIN_ALBEDO = 1e-4
 # The fitted formulas in the bounds are too low by at most these amounts, which are added to the formulas.
 SPEC_MARGIN = 0.009

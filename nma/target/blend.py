@@ -116,7 +116,7 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
 
 def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[LobeProbabilities, ...]:
     """The probability of each lobe of each instance: the instance's weight times the lobe's albedo bound, divided by
-    the sum."""
+    the sum over all lobes."""
     albedos = [lobe_albedos(p, cos_theta_i) for p in blend.instances]
     means = [LobeProbabilities(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat) for a in albedos]
     total = sum(w * (m.diffuse + m.spec + m.clearcoat) for w, m in zip(blend.weights, means, strict=True))

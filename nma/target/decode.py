@@ -46,7 +46,8 @@ class TargetParam:
         return self.low + (self.high - self.low) * unit
 
     def encode(self, value: Float) -> Float:
-        """The inverse of `decode`. The value is first clipped away from the ends of the range."""
+        """The inverse of `decode`. The value is first clipped away from the ends of the range, so that the result is
+        finite."""
         if self.scale == "log":
             value = ops.maximum(value, self.low)
             return logit(ops.log(value * (1.0 / self.low)) * (1.0 / math.log(self.high / self.low)))
@@ -72,9 +73,9 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
 # plane.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
-# Measured materials need three more parameters. A fade is needed for RGL's measurements, for example. They are zero
-# where the half vector is tilted by more than about 70 degrees, which the instrument does not reach. A wide fade also
-# changes the shape of the diffuse lobe.
+# Measured materials need three more parameters. A fade is needed for RGL's measurements, for example. These
+# measurements are zero where the half vector is tilted by more than about 70 degrees, which the instrument does not
+# reach. A wide fade also changes the shape of the diffuse lobe.
 MEASURED_PARAMS = (
     *STRETCHED_PARAMS,
     TargetParam("flatness"),

@@ -7,8 +7,8 @@ the light. Values are f cos(theta_o).
 Deliberate differences from Mitsuba's plugin, all of them small:
 - Narrow peaks are more precise. GGX and GTR1 are computed from the components of the half vector, never from 1 +
   (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is wrong by several per cent at alpha .001.
-- `specular` may vary over the surface, and 0 means no dielectric reflection. In Mitsuba, 0 also removes the reflection
-  of metals.
+- `specular` may vary over the surface, and 0 means no dielectric reflection. In Mitsuba, `specular` = 0 also removes
+  the reflection of metals.
 - The cosine between a direction and the half vector is computed as |wi + wo| / 2, the same for both directions. Mitsuba
   computes the dot product of `wi` and the half vector, whose rounding error is large where both directions are grazing
   and nearly opposite.
@@ -30,7 +30,7 @@ from nma.microfacet import ggx_d
 from nma.ops import Color, Float, Mask, Vec3
 
 DIALECT = "mitsuba-principled-reflection"
-MIN_ALPHA = 0.001  # Mitsuba's floor of the microfacet width
+MIN_ALPHA = 0.001  # the smallest microfacet width, as in Mitsuba
 MIN_COS = 1e-9  # directions closer to the horizon are invalid
 CLEARCOAT_MASKING_ALPHA = 0.25  # Burley 2012, section 5.6
 CLEARCOAT_F0 = 0.04
@@ -68,7 +68,7 @@ class Geometry(NamedTuple):
     wo: Vec3
     h: Vec3  # half vector
     cos_d: Float  # cosine between either direction and the half vector
-    weight_i: Float  # Schlick weights of the three cosines
+    weight_i: Float  # Schlick weights of wi.z, wo.z and cos_d
     weight_o: Float
     weight_d: Float
     clearcoat: Float  # value of the clearcoat without its strength and distribution of normals
