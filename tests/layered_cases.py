@@ -40,7 +40,7 @@ CASES = {
     },
     "index_matched": {"alpha_top": 1e-4, "alpha_bottom": 0.2, "eta_top": 1.0, "sigma_t": 1.0, "albedo": 0.7},
 }
-# Tests with many walks run three cases always, and all other cases only with the slow tests.
+# Tests with many walks always run three of the cases. The slow tests run all cases.
 SLOW_CASES = [
     name if name in ("narrow_wide", "thick", "white_coated") else pytest.param(name, marks=pytest.mark.slow)
     for name in CASES

@@ -243,9 +243,9 @@ def scene(bsdf, name="material", **integrator):
 
 
 def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
-    """Pictures from curves and from the network, with symbolic and with evaluated loops, are equal up to rounding.
+    """A material renders the same picture from curves as from the network, up to rounding.
 
-    All pictures use the same random numbers.
+    Pictures with evaluated loops also equal pictures with symbolic loops. All pictures use the same random numbers.
     """
     curves = np.array(mi.render(scene(description(weights)), spp=16, seed=1))
     loaded = scene(textured(weights))

@@ -82,8 +82,8 @@ def test_the_error_is_variance_and_squared_bias_without_the_noise_of_the_converg
     for bias in (0.0, 0.3):
         pictures = noisy(rng, 1.0 + bias, 0.5, 8)
         found = frames.figures(frames.Frames(pictures, np.ones(8), np.ones(8)), reference)
-        # The converged picture has a variance of 0.09. The error would be 0.09 larger if that variance were not
-        # subtracted.
+        # The converged picture has a variance of 0.09. The error would be 0.09 larger if the variance of the converged
+        # picture were not subtracted.
         assert found["variance"] == pytest.approx(0.25, rel=0.03)
         assert found["error"] == pytest.approx(0.25 + bias**2, rel=0.05)
         assert 0.0 < found["doubt"] < 0.05

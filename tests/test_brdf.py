@@ -133,7 +133,7 @@ def off(found, expected):
 def test_evaluating_a_blend_without_its_frame_is_wrong(kind):
     """The values of a blend that is evaluated without its frame are more than 40 % off.
 
-    So the other tests in this file would detect a BRDF that ignores its frame.
+    The large error shows that the other tests in this file would detect a BRDF that ignores its frame.
     """
     wi, wo = pairs()
     brdf = prepared(kind, wi)
@@ -186,7 +186,7 @@ def test_an_anisotropic_adapter_has_no_curves():
 
 
 def test_a_cosine_in_place_of_the_direction_is_refused():
-    """`prepare` took a cosine in older versions. If it gets a cosine, an error message says how to make a direction."""
+    """`prepare` took cosines in older versions. The error message for a cosine says how to make a direction."""
     adapter = Adapter.load("layered3-3x32")
     columns = list(LAYERED3.sample(np.random.default_rng(0), 2).T)
     for cosine in (0.5, np.array([0.5, 0.6]), mi.Float(0.5)):

@@ -20,7 +20,10 @@ FUNCTIONS = dict(commands())
 
 
 def arguments(words, output):
-    """Returns the words of a command that writes `output`. The input files of the command do not exist."""
+    """Returns the words of a command that writes `output`.
+
+    The input files do not exist, because the command must refuse a bad output before it reads any input.
+    """
     given = []
     for name, _, info in parameters(FUNCTIONS[words]):
         if isinstance(info, ArgumentInfo):

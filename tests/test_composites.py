@@ -1,6 +1,6 @@
 """Our BSDFs inside Mitsuba's composite BSDFs: the picture of a composite is the weighted sum of its parts' pictures.
 
-Each integrator renders one sheet of small cells under the same sky. Each cell shows one BSDF, alone or in a composite.
+Each integrator renders one sheet of small cells under a sky. Each cell shows one BSDF, alone or in a composite.
 """
 
 import gc

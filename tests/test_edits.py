@@ -245,7 +245,7 @@ def test_wrong_edits_are_refused_and_not_rendered(adapter, kind, what):
 
 @pytest.mark.parametrize("kind", BESIDE)
 def test_of_several_edits_only_the_wrong_ones_are_undone(adapter, kind):
-    """If an update has several edits, all wrong ones are undone, and all correct ones take effect."""
+    """If an update has several edits, edits with wrong values are undone, and all correct edits take effect."""
     bsdf = BESIDE[kind](adapter)
     bsdf = bsdf if "layered" in kind else bsdf | {"clamp": False}
     loaded = scene(bsdf)

@@ -1,6 +1,6 @@
 """All code writes files through `nma.files`, so that no partly written file remains after an error.
 
-The tests search the code for calls that write files in other ways.
+The tests search the code for calls that write files without `nma.files`.
 """
 
 import ast

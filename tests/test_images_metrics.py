@@ -55,7 +55,10 @@ def test_ssim_sees_noise_rather_than_brightness(picture):
 
 
 def test_ldr_metrics_see_differences_beyond_white_only_at_lower_exposure(picture):
-    """A difference beyond white is clipped, so that the LDR metric is zero. A lower exposure shows the difference."""
+    """The LDR metric of two pictures is zero if they differ only beyond white, because values beyond white are clipped.
+
+    At a lower exposure, the LDR metric shows the difference.
+    """
     bright = picture + 2.0
     clipped = compare_images(bright * 1.2, bright)
     lowered = compare_images(bright * 1.2, bright, ldr_exposure=-4.0)

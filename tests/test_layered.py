@@ -104,7 +104,7 @@ def test_comparison_would_see_two_percent():
 def test_integral_of_rough_coat_over_white_conductor():
     """The albedo at cos(theta_i) = .9 is .556, to three digits.
 
-    In two public programs, evaluation and random walks give different albedos for this material.
+    In two public programs, evaluation and random walks give different albedos for this rough coat over a conductor.
     """
     n = 1 << 20
     _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), random(n, 5))

@@ -283,7 +283,7 @@ def test_white_furnace():
     }
     result = measure(mi.load_dict(description), 1024, 6, warmup=False)
     one = np.ones_like(result.mean)
-    # Even at this small roughness, microfacets block about .1 % of the light at grazing angles below the coat. So the
+    # At grazing angles below the coat, microfacets block about .1 % of the light even at a small roughness, so that the
     # test allows a difference of 1e-3.
     same = zscore_images(result.mean, result.variance, 6, one, 0 * one, 1, rounding=1e-3, false_alarm=1e-3)
     assert same.passed, f"p {same.p_values.min():.1e} below {same.level:.1e} at {same.worst}"

@@ -63,7 +63,7 @@ def test_the_studio_leaves_weaker_fireflies_than_outdoors():
 def test_outdoors_is_the_lighting_of_the_committed_results():
     """The mean colour of a picture is the same as when the results of benches and figures were committed.
 
-    A failure means that the lighting has changed, so that new results cannot be compared with the committed ones.
+    A failure means that the lighting has changed, so that new results cannot be compared with the committed results.
     """
     image = render("outdoors", 256, size=32, seed=3, bsdf=GREY)
     assert image.mean(axis=(0, 1)) == pytest.approx([0.2899, 0.2851, 0.2839], rel=0.01)
@@ -86,8 +86,8 @@ def test_unknown_lightings_and_a_missing_sun_are_refused():
 def test_multijittered_samples_fill_a_grid(spp, pixels, capfd):
     """`sampler` chooses the sampler `multijitter` only for sample counts that Mitsuba does not change.
 
-    Mitsuba rounds all other sample counts up, and prints a warning. A failure means that a picture has more samples
-    than the user asked for.
+    Mitsuba rounds a count up if the samples do not fill a grid, and prints a warning. A failure means that a picture
+    has more samples than the user asked for.
     """
     kind = sampler(spp, pixels)
     for samples in pass_sizes(spp, pixels):

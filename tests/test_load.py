@@ -131,7 +131,7 @@ def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
 def test_textures_of_eight_bits_are_checked_by_the_values_they_evaluate_to(model, tmp_path):
     """A pixel of byte 20 has the value .078 if the texture is `raw`, and .007 in linear light otherwise.
 
-    The adapter accepts `alpha_top` from .001 to .316. So it accepts byte 20 and refuses byte 0.
+    The adapter accepts `alpha_top` from .001 to .316, so that byte 20 is accepted and byte 0 is refused.
     """
     Image.fromarray(np.full((4, 4), 20, np.uint8)).save(tmp_path / "grey.png")
     bsdf = material_bsdf(materials.load("wet-nickel"), model)

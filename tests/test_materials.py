@@ -201,7 +201,7 @@ NASTY += ("[" * 3000, "1" * 400, "1" * 5000, "0x" + "f" * 9000, '"' + "a" * 5000
 def test_any_file_either_loads_or_is_refused_in_one_line(material_file):
     """400 random faulty files either load or raise an error of one short line.
 
-    Each faulty file is a good one with one or two keys or values replaced, and sometimes with a piece cut out.
+    Each faulty file is a correct file with one or two keys or values replaced, and sometimes with a piece cut out.
     """
     path, rng = material_file(), np.random.default_rng(0)
     good = [re.split("( = )", line) for line in path.read_text().strip().splitlines()]
@@ -291,7 +291,7 @@ def test_a_vector_becomes_a_material_and_back():
 def test_descriptions_promise_no_effect_that_the_class_lacks(name):
     """No description of a material mentions effects such as brushing or flakes.
 
-    The model cannot show such effects, because its layers are isotropic and homogeneous.
+    The model cannot show brushing or flakes, because its layers are isotropic and homogeneous.
     """
     text = materials.load(name).description.lower()
     assert not [word for word in ("brush", "flake", "spark", "scratch", "grain", "fibre") if word in text]

@@ -59,7 +59,7 @@ def test_distribution_is_the_density_of_its_slopes(alphas):
 @pytest.mark.parametrize("cos", (0.1, 0.5, 0.95))
 def test_visible_area_projects_to_the_macrosurface(alphas, cos):
     # Smith's masking function G1 is derived from a condition: the visible microfacets project to the area cos(theta) of
-    # the macrosurface. So the integral of D(m) G1 max(dot(w, m), 0) over m is cos(theta) (Heitz 2014, eq. 43).
+    # the macrosurface. The projected area is the integral of D(m) G1 max(dot(w, m), 0) over m (Heitz 2014, eq. 43).
     m, weight = normals(*alphas)
     w = direction(cos, 0.7)
     g1 = smith_g1(w, *alphas)

@@ -211,7 +211,7 @@ def test_a_measured_material_has_the_values_of_its_file(measurements, material):
 
 
 def test_a_material_with_azimuths_of_incidence_is_anisotropic(bsdf_file, tmp_path):
-    """The test makes an anisotropic material from an isotropic one: its brightness varies with the azimuth."""
+    """The test makes an isotropic material anisotropic by changing its brightness with the azimuth of incidence."""
     fields, azimuths = rgl.read(bsdf_file), np.linspace(-math.pi, math.pi, 5).astype(np.float32)
     tiled = {name: np.repeat(fields[name], 5, axis=0) for name in ("vndf", "luminance", "rgb")}
     tiled["rgb"] = tiled["rgb"] * np.array([1, 2, 3, 4, 1], np.float32)[:, None, None, None, None]

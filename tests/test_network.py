@@ -1,4 +1,4 @@
-"""Networks, encodings and adapters compute the same in all array packages, and decoded parameters stay in range."""
+"""Networks, encodings and adapters give equal results in all array packages, and decoded parameters stay in range."""
 
 from dataclasses import replace
 

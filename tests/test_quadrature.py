@@ -114,8 +114,8 @@ def test_points_lie_in_their_bins(law, dtype):
     rng = np.random.default_rng(3)
     below_one = np.nextafter(dtype(1), dtype(0))
     corners = [np.full((3, len(i)), u, dtype) for u in (0.0, below_one)]
-    # `bin_points` keeps the cosines of both directions above 1e-6. This correction of one cosine may move the other
-    # cosine out of its bin by 1e-6.
+    # `bin_points` keeps the cosines of wi and wo above 1e-6. If `bin_points` raises one cosine, the other cosine may
+    # move out of its bin by 1e-6.
     slack = 1e-6 + 4 * np.finfo(dtype).eps
     for u in (*corners, rng.random((3, len(i)), dtype), rng.integers(0, 2, (3, len(i))) * below_one):
         points = law(i, o, p, tuple(u.astype(dtype)))

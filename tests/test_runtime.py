@@ -1,4 +1,4 @@
-"""The C++ runtime computes the same as the package: the target, the network, samples and curves."""
+"""The target, the network, samples and curves of the C++ runtime equal those of the package."""
 
 import ctypes
 import re
@@ -17,7 +17,7 @@ from nma.ops import Vec3, at_azimuth_0
 from nma.params import MEASURED
 
 CASES = 4000
-# The count of numbers per instance. `Principled` has one field per number, except for the colour with three numbers.
+# The count of numbers in the array of an instance. The colour is one field of `Principled`, but three numbers.
 PRINCIPLED_SIZE = len(target.Principled._fields) + 2
 
 pytestmark = pytest.mark.usefixtures("compiler")

@@ -1,4 +1,4 @@
-"""Anisotropic adapters, whose input is the whole view direction, compute the same in C++ as in the package."""
+"""Anisotropic adapters, whose input is the whole view direction, give equal results in C++ and in the package."""
 
 import ctypes
 import subprocess

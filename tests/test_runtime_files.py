@@ -185,7 +185,7 @@ def test_unusual_but_valid_files_load(tmp_path):
 def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
     """The runtime accepts only the parameters in the adapter's record, up to rounding, even beyond the training range.
 
-    `nma.adapter.Adapter.check` in the package accepts and refuses the same parameters.
+    `nma.adapter.Adapter.check` in the package accepts the same parameters as the runtime.
     """
     path, vector = tmp_path / "one.safetensors", LAYERED3.sample(np.random.default_rng(0), 1)[0]
     vector[12] = 3.0

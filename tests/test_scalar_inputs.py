@@ -36,7 +36,7 @@ EDITS = """
 def test_edits_are_rendered_at_once_or_refused(kind):
     """An edit of a number, a colour or pixels takes effect at once. A bad value is refused.
 
-    After a refused edit nothing is rendered until a correct value replaces the bad one.
+    After a refused edit, nothing is rendered until a correct value replaces the wrong value.
     """
     finished(
         EDITS

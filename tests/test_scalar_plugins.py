@@ -113,8 +113,8 @@ def test_composites_are_linear_combinations_of_their_parts():
     """
     layered, nma, diffuse = {"type": "layered", **MATERIAL}, {"type": "nma", **MATERIAL}, {"type": "diffuse"}
     flat = {"type": "normalmap", "normalmap": {"type": "srgb", "color": [0.5, 0.5, 1.0]}}
-    # Each composite has four weights. The picture of the composite is the sum of four pictures with these weights: of
-    # layered, of nma, of diffuse, and of the sky.
+    # Each composite has four weights. The picture of the composite is the weighted sum of four pictures: of layered, of
+    # nma, of diffuse, and of the sky.
     composites = {
         "blend": (blend(0.3, layered, diffuse), (0.7, 0, 0.3, 0)),
         "mask": (mask(0.6, layered), (0.6, 0, 0, 0.4)),
@@ -140,7 +140,7 @@ def test_composites_are_linear_combinations_of_their_parts():
 def test_diffuse_reflectance_is_the_directional_albedo(tmp_path):
     """The diffuse reflectance of a BSDF equals the mean weight of 20,000 samples at wi, within a tolerance.
 
-    The reflectance has no noise, is at most 1, and is 0 from behind.
+    The reflectance has no noise and is at most 1. If the material is seen from behind, the reflectance is 0.
     """
     random_anisotropic_adapter().save(tmp_path / "brushed.safetensors")
     finished(

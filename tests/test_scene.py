@@ -246,7 +246,7 @@ def test_ztest_false_alarms_are_as_stated():
 
 
 def test_ztest_of_renders_accepts_equal_and_rejects_two_percent_of_energy():
-    """The Z-test accepts two sets of 12 renders of one scene, and rejects one set that is 2 % brighter.
+    """The Z-test accepts two sets of 12 renders of one scene as equal, and rejects them if one set is 2 % brighter.
 
     Each render has 24 x 24 pixels and 32 samples per pixel. The false-alarm rate is 1 %; seeds are fixed.
     """

@@ -176,7 +176,8 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         / steps**2
     )
 
-    # Unfold the folded table to the whole circle. Then average the circle with a triangle of weights around each d.
+    # Unfold the folded table to the whole circle. Then average the circle with a triangle of weights around each
+    # difference d.
     circle = np.concatenate([folded.values[0, ..., 0], folded.values[0, ..., ::-1, 0]], axis=2)
     noise = np.concatenate([folded.error[0, ..., 0], folded.error[0, ..., ::-1, 0]], axis=2)
     expected, expected_variance = np.empty_like(by_difference), np.empty_like(by_difference)
@@ -186,8 +187,8 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         weights = np.maximum(1.0 - away, 0.0)
         weights /= weights.sum()
         expected[..., d] = circle @ weights
-        # The two halves of the circle contain the same bins with the same errors. So the weights of the halves are
-        # added before they are squared.
+        # The weights of the two halves of the circle are added before they are squared, because the halves contain the
+        # same bins with the same errors.
         halves = weights[: steps * fine // 2] + weights[steps * fine // 2 :][::-1]
         expected_variance[..., d] = noise[..., : steps * fine // 2] ** 2 @ halves**2
     z = np.abs(by_difference - expected) / np.sqrt(variance + expected_variance)
@@ -382,7 +383,7 @@ def test_tables_of_several_classes_are_not_joined(tables):
 
 @pytest.mark.parametrize(("columns", "name"), [(13, "layered3"), (0, "measured"), (32, "library")])
 def test_a_file_without_a_class_is_of_the_only_class_with_as_many_columns(tables, tmp_path, columns, name):
-    """Earlier versions of the package wrote such files."""
+    """Earlier versions of the package wrote tables without the name of their class."""
     np.savez(tmp_path / "old.npz", **_arrays(tables, params=np.full((2, columns), 0.3)))
     found = Tables.load(tmp_path / "old.npz")
     assert (found.class_name, found.space) == (name, sources.space(name))

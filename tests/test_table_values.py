@@ -146,8 +146,8 @@ def test_stated_errors_are_the_spread_of_the_means():
     stated = tables.error.astype(np.float64)[..., 0]
     assert 0.5 < np.sum(deviation**2) / np.sum(stated**2) < 2.0
     assert 0.5 < np.median(np.abs(deviation)) / np.median(stated) < 1.2
-    # A table states a count of random walks of similar accuracy. With that count of walks, about half of the bins would
-    # have a larger error than the table states.
+    # A table from quadrature states how many random walks would give a similar accuracy. With so many walks, about half
+    # of the bins would have a larger error than the table states.
     counting = metrics.counting_error(
         tables.values[0], int(tables.walks[0]), Grid(10, 10, 10).solid_angle, 10
     )

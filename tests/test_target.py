@@ -22,7 +22,10 @@ SINGLE_EPS = 2.0**-24
 
 
 def to_single(tree):
-    """Rounds to single precision and converts back to double, so that both precisions get exactly the same inputs."""
+    """Rounds to single precision and converts back to double precision.
+
+    So computations in single and in double precision get exactly the same inputs.
+    """
     return mapped(tree, lambda x: x.astype(np.float32).astype(np.float64))
 
 
@@ -123,9 +126,9 @@ def test_eval_equals_mitsuba_principled():
 
 @pytest.mark.parametrize("gloss", (0.0, 0.3, 0.9, 1.0))
 def test_clearcoat_distribution_is_normalised(gloss):
-    # Rounding in Mitsuba prevents a precise comparison of clearcoats. So this test checks the scale of the clearcoat's
-    # distribution D: the integral of D cos(theta_h) over all half vectors is 1. With the variable s = sin^2(theta_h),
-    # the integrand is pi D. The variable x = log(s + alpha^2) spreads the peak of D evenly.
+    # Rounding in Mitsuba prevents a precise comparison of clearcoats, so that this test checks the scale of the
+    # clearcoat's distribution D. The integral of D cos(theta_h) over all half vectors must be 1. With the variable
+    # s = sin^2(theta_h), the integrand is pi D. The variable x = log(s + alpha^2) spreads the peak of D evenly.
     alpha = clearcoat_alpha(gloss)
     low, high = np.log(alpha**2), np.log(1 + alpha**2)
     x = low + (high - low) * (np.arange(20_000) + 0.5) / 20_000

@@ -57,7 +57,7 @@ def assert_equal_means(found, error, expected):
 def test_white_furnace_loses_nothing(eta_top, sigma_t):
     """If nothing absorbs light, the albedo is 1, even if walks are long.
 
-    So Russian roulette must not end walks, except for walks that are trapped.
+    Russian roulette must not end walks, except for walks that are trapped.
     """
     results = [
         albedo(mu, 1 << 16, eta_top=eta_top, sigma_t=sigma_t, **WHITE, **FLAT) for mu in (1.0, 0.3, 0.05)
@@ -159,7 +159,7 @@ def test_isotropic_slab_over_black():
 def test_rough_coat_over_white_conductor():
     """The albedo of a rough coat over a white conductor is .556, to three digits.
 
-    In two public programs, evaluation and random walks give different albedos for this material.
+    In two public programs, evaluation and random walks give different albedos for this rough coat over a conductor.
     """
     found, error = albedo(0.9, 1 << 20, eta_top=1.5, alpha_top=0.2, alpha_bottom=0.4, **WHITE)
     assert_equal_means(found, error + 0.5e-3 / 3.3, 0.556)
