@@ -144,7 +144,7 @@ def test_a_writer_that_fails_leaves_no_chunk(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(DatasetError, match="cannot write.*No space left.*again to go on"):
+    with pytest.raises(DatasetError, match="cannot write.*No space left.*again to continue"):
         data.write()
     assert data.missing().tolist() == [0]
 

@@ -137,7 +137,7 @@ def test_tables_are_fitted_bin_by_bin(grid):
 
 def test_a_fit_refuses_a_table_of_several_materials():
     tables = tabulate_values(LAMBERT, grid=SMALL)
-    with pytest.raises(TableError, match="a fit is for one material, the table has 2"):
+    with pytest.raises(TableError, match="a fit is for one material, but the table has 2 materials"):
         fit(Tables.concatenate([tables, tables]))
 
 

@@ -316,8 +316,8 @@ def _arrays(tables, **changes):
         ({"walks": np.array([1, 2, 3])}, "walks must be"),
         ({"walks": np.array([100, 0])}, "walks must be"),
         ({"walks": np.array(["many", "few"])}, "not numbers"),
-        ({"params": np.full((2, 13), np.nan)}, "params of material 0 is not finite"),
-        ({"error": np.full((2, 4, 5, 6, 3), np.inf)}, "error of material 0 is not finite"),
+        ({"params": np.full((2, 13), np.nan)}, "params of material 0 has values that are not finite"),
+        ({"error": np.full((2, 4, 5, 6, 3), np.inf)}, "error of material 0 has values that are not finite"),
         ({"params": np.array([None, {}], object)}, "not a reference file"),
         ({"class": np.array(["layered3"])}, "the entry `class` has type <U8 and shape"),
         ({"class": 3}, "the entry `class` has type int64"),
@@ -337,7 +337,7 @@ def test_a_malformed_reference_file_is_refused(tables, tmp_path, change, message
 def test_a_table_with_nan_names_the_material(tables, tmp_path):
     tables.values[1, 0, 0, 0, 0] = np.nan
     tables.save(tmp_path / "nan.npz")
-    with pytest.raises(TableError, match="table of material 1 is not finite"):
+    with pytest.raises(TableError, match="table of material 1 has values that are not finite"):
         Tables.load(tmp_path / "nan.npz")
 
 

@@ -101,7 +101,7 @@ def test_the_fit_is_an_adapter_that_can_be_saved(fit, coated, tmp_path):
 
 
 def test_only_isotropic_tables_of_one_material_are_fitted(red):
-    with pytest.raises(TableError, match="one material, the table has 2"):
+    with pytest.raises(TableError, match="one material, but the table has 2 materials"):
         fit_constant(Tables.concatenate([red, red]))
     with pytest.raises(TableError, match="isotropic tables"):
         fit_constant(Tables(np.zeros((1, 0)), np.zeros((1, 2, 4, 2, 4, 3)), np.ones(1, np.int64)))

@@ -15,20 +15,24 @@ from nma.sources.base import Values
 from nma.table.grid import Tables, kept
 from nma.table.values import tabulate_values
 
-# Digits of the material file's SHA-256 in the name of its table's file, so that a table is never used for another file.
+# The name of a table's file contains this many digits of the SHA-256 of the material's file. If the material's file
+# changes, the saved table is therefore no longer used.
 _DIGEST = 12
 
 
 @dataclass(frozen=True)
 class Member:
-    """One material of a collection. If its file holds several materials, `material` says which one it is."""
+    """One material of a collection.
+
+    If a file holds several materials, `material` is the material's name in the file.
+    """
 
     name: str
     path: Path
     material: str | None = None
 
     def read(self) -> Values:
-        """The material as a source. Raises `SourceError` if the file cannot be read."""
+        """Reads the material as a source. Raises `SourceError` if the file cannot be read."""
         return sources.read(self.path, self.material)
 
 
@@ -37,7 +41,7 @@ def members(path: str | Path) -> list[Member]:
 
     Files are chosen by their extension, which must be one that `nma.sources.read` understands. In an NBRDF weights file
     each network is a material. Subfolders are not searched. Raises `SourceError` if there is no material, or if two
-    have the same name.
+    materials have the same name.
     """
     path = Path(path)
     if not path.exists():
@@ -60,7 +64,7 @@ def _of_file(file: Path) -> list[Member]:
 
 
 def origin(chosen: Sequence[Member]) -> str:
-    """The origin of the materials, for messages and records: a name such as NBRDF-MERL, or their files' extensions."""
+    """The origin of the materials, for messages and records: a name such as NBRDF-MERL, or the files' extensions."""
     return ", ".join(sorted({_origin(path) for path in {member.path for member in chosen}}))
 
 
@@ -72,11 +76,11 @@ def _origin(file: Path) -> str:
 def tables(
     chosen: Sequence[Member], folder: str | Path, progress: Callable[[int], None] = lambda done: None
 ) -> Tables:
-    """The tables of the materials `chosen`, in that order.
+    """The tables of the materials in `chosen`, in the same order.
 
-    Each table is saved in `folder` once it is made, so that a killed run can go on. A later call uses a saved table
-    only if the material's file still has the same content. Raises `SourceError` if a file cannot be read, and
-    `TableError` if a material is anisotropic.
+    Each table is saved in `folder` as soon as it is made, so that an interrupted run can be continued. A later call
+    uses a saved table only if the material's file still has the same content. Raises `SourceError` if a file cannot be
+    read, and `TableError` if a material is anisotropic.
     """
     digests: dict[Path, str] = {}
     made = []

@@ -1,9 +1,9 @@
 """Datasets: tables of many random materials of a class, stored on disk as one zarr chunk per material.
 
-Any number of workers may write a dataset, and a killed run goes on where it stopped. zarr (3.1.3 or later) writes a
-chunk to a temporary file and renames it, so a chunk that exists is complete. A material and its random stream depend
-only on (seed, index). So workers need no coordination: if two of them simulate the same material, they write the same
-bytes.
+Any number of workers may write a dataset at the same time, and a run that was interrupted can be continued. zarr (3.1.3
+or later) first writes a chunk to a temporary file and then renames the file, so a chunk that exists is complete. A
+material and its random stream depend only on the dataset's seed and the material's index. So workers need no
+coordination: if two workers simulate the same material, they write the same bytes.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from nma.table.grid import ISOTROPIC, Tables
 from nma.table.walks import stream_keys, tabulate
 
 FORMAT = 1
-# The number of materials that are simulated at once. `_BLOCK_WALKS` limits it further, so that a killed run loses that
-# many walks at most. Neither changes the result.
+# The materials that are simulated at once are called a block. A block has at most `_BLOCK` materials, and at most
+# `_BLOCK_WALKS` walks unless a single material needs more. An interrupted run loses only the walks of the current
+# block. Both limits leave the result unchanged.
 _BLOCK = 16
 _BLOCK_WALKS = 1 << 27
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings that determine every number of a dataset. `walks` is the number of random walks per material.
+    """The settings that determine every value in a dataset. `walks` is the number of random walks per material.
 
     `nma dataset --help` explains the other settings. Raises `DatasetError` if a setting is out of range.
     """
@@ -57,25 +58,29 @@ class Settings:
             )
         if self.population not in get_args(Population) or self.population == "unseen_metals":
             known = ", ".join(p for p in get_args(Population) if p != "unseen_metals")
-            # Materials are drawn one by one, and "unseen_metals" chooses by the position among all that are drawn.
+            # "unseen_metals" takes every third material of one call of `ParamSpace.sample` from the held-out metals. A
+            # dataset draws each material in a call of its own, so this population is not possible.
             raise DatasetError(f"a dataset's population is one of {known}; got '{self.population}'")
 
 
 def draw_params(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.float64]:
-    """Parameter vectors (n, columns) of the materials `indices`, each drawn from the material's own random stream."""
+    """Draws the parameter vectors (n, columns) of materials, each from the random stream of the material's index."""
     space = sources.get(settings.class_name).space
     rows = [np.random.default_rng((settings.seed, int(i), 0x9A7A)) for i in indices]
     return np.concatenate([space.sample(rng, 1, settings.population) for rng in rows])
 
 
 def _fingerprint(settings: Settings) -> str:
-    """A digest of drawn parameters. Versions of the package that draw other parameters have another digest."""
+    """A digest of the first and the last material's parameters.
+
+    Versions of the package that draw other parameters from the same seed have another digest.
+    """
     ends = draw_params(settings, [0, settings.materials - 1]).astype(np.float32)
     return hashlib.sha256(ends.tobytes()).hexdigest()[:16]
 
 
 def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> Tables:
-    """The tables of the materials `indices`, without standard errors."""
+    """The tables of the materials with these indices, without standard errors."""
     source = sources.get(settings.class_name)
     return tabulate(
         source,
@@ -87,14 +92,17 @@ def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[i
 
 
 class Dataset:
-    """A dataset on disk. `create` and `open` return one, `write` completes it, and `load` reads its tables."""
+    """A dataset on disk.
+
+    `create` and `open` return a dataset, `write` adds the missing tables, and `load` reads tables.
+    """
 
     def __init__(self, path: Path, settings: Settings, table: zarr.Array):
         self.path, self.settings, self._table = path, settings, table
 
     @staticmethod
     def create(path: str | Path, settings: Settings) -> Dataset:
-        """Opens the dataset at `path`, or creates it if there is none.
+        """Opens the dataset at `path`, or creates a dataset there if `path` has none.
 
         Raises `DatasetError` if the dataset was made with other settings.
         """
@@ -114,10 +122,10 @@ class Dataset:
 
     @staticmethod
     def open(path: str | Path) -> Dataset:
-        """Opens the dataset at `path`. Raises `DatasetError` if there is none, or if another version made it."""
+        """Opens the dataset at `path`. Raises `DatasetError` if `path` has no dataset that this version can read."""
         path = Path(path)
         try:
-            # Chunks of zeros are stored, too, because a chunk's file marks its material as done.
+            # Chunks of zeros are stored, too, because a material counts as simulated if the file of its chunk exists.
             table = zarr.open_array(path, mode="r+", config={"write_empty_chunks": True})
             settings = Settings(**dict(table.attrs["nma_dataset"]))  # type: ignore[arg-type]
             fingerprint = table.attrs["nma_params"]
@@ -129,11 +137,11 @@ class Dataset:
             raise DatasetError(f"{path} is not a dataset of tables ({reason}); {advice}") from None
         if settings.format != FORMAT:
             raise DatasetError(
-                f"{path} has format {settings.format}, this version reads {FORMAT}; generate it again"
+                f"{path} has format {settings.format}, but this version reads format {FORMAT}; make the dataset again"
             )
         if fingerprint != _fingerprint(settings):
             raise DatasetError(
-                f"{path} was made by a version that drew other parameters from its seed; generate it again"
+                f"{path} was made by a version that drew other parameters from the same seed; make the dataset again"
             )
         return Dataset(path, settings, table)
 
@@ -144,13 +152,13 @@ class Dataset:
         return os.path.exists(self._chunk(index))
 
     def missing(self) -> NDArray[np.int64]:
-        """Indices of the materials whose tables are not on disk yet."""
+        """The indices of the materials whose tables are not on disk yet."""
         return np.array([i for i in range(self.settings.materials) if not self._has(i)], np.int64)
 
     def write(self, progress: Callable[[int], None] = lambda done: None) -> None:
         """Simulates and stores the missing materials.
 
-        Calls `progress` with the number of materials on disk, which includes those that other workers have written.
+        After each block, calls `progress` with the number of materials on disk, including materials of other workers.
         """
         size = max(1, min(_BLOCK, _BLOCK_WALKS // self.settings.walks))
         blocks = np.array_split(np.arange(self.settings.materials), -(-self.settings.materials // size))
@@ -169,11 +177,11 @@ class Dataset:
                 self._table[i] = value
         except OSError as e:
             raise DatasetError(
-                f"{self.path}: cannot write ({e}); run the same command again to go on"
+                f"{self.path}: cannot write ({e}); run the same command again to continue"
             ) from None
 
     def load(self, indices: NDArray[np.integer] | range | None = None) -> Tables:
-        """The tables (float16) of the materials `indices`, or of all materials.
+        """The tables (float16) of the materials with these indices, or of all materials.
 
         Raises `DatasetError` if a chunk is missing or damaged.
         """
@@ -187,7 +195,7 @@ class Dataset:
             if not self._has(i):
                 raise DatasetError(
                     f"{self.path}: material {i} is missing ({len(self.missing())} are missing in all); "
-                    f"run `nma dataset {self.settings.class_name} {self.path}` with its settings to complete it"
+                    f"run `nma dataset {self.settings.class_name} {self.path}` with the same settings to simulate them"
                 )
             try:
                 values[row] = self._table[int(i)]

@@ -1,9 +1,9 @@
 """BSDF tables whose bins have equal solid angles: their grid and their files.
 
-Isotropic tables have shape (n, theta_i, theta_o, phi, 3). Their bins are uniform in cos(theta_i) and cos(theta_o), with
-index 0 at grazing, and in the azimuth between wi and wo. The azimuth is folded to [0, pi], with the mirror direction in
-the last bin. Anisotropic tables have shape (n, theta_i, phi_i, theta_o, phi_o, 3), with azimuths over [0, 2 pi). A
-value is the mean of f cos(theta_o) over its bin [1/sr].
+Isotropic tables have shape (n, theta_i, theta_o, phi, 3). Their bins are uniform in cos(theta_i), in cos(theta_o) and
+in the azimuth between wi and wo. Index 0 of the two cosines is at grazing angles. The azimuth is folded to [0, pi], so
+the mirror direction is in the last bin. Anisotropic tables have shape (n, theta_i, phi_i, theta_o, phi_o, 3), with
+azimuths over [0, 2 pi). The value of a bin is the mean of f cos(theta_o) over the bin [1/sr].
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ from nma.params import ParamSpace
 
 @dataclass(frozen=True)
 class Grid:
-    """The number of bins of a table in each dimension. `phi_i == 0` means an isotropic, folded table."""
+    """The number of bins of a table in each dimension.
+
+    `phi_i == 0` means an isotropic table, whose azimuth is folded.
+    """
 
     theta_i: int = 40
     theta_o: int = 40
@@ -51,11 +54,11 @@ class Grid:
 
     @property
     def solid_angle(self) -> float:
-        """The solid angle of a bin of wo [sr]. A folded bin has two mirror halves, and both count."""
+        """The solid angle of a bin of wo [sr]. For a folded bin it includes both mirror halves."""
         return 2.0 * math.pi / (self.theta_o * self.phi_o)
 
     def walks(self, wanted: int) -> int:
-        """`wanted`, rounded up to a multiple of `rows`, so that every row gets the same number of walks."""
+        """The number `wanted`, rounded up to a multiple of `rows`, so that every row gets the same number of walks."""
         return -(-wanted // self.rows) * self.rows
 
 
@@ -67,10 +70,10 @@ ANISOTROPIC = Grid(phi_o=80, phi_i=80)
 class Tables:
     """The tables of n materials.
 
-    `params` (n, columns) are the materials' parameters, `values` (n, *grid.shape) their tables. `walks` (n,) are the
-    numbers of random walks. `error` has the standard error of each value, or is None. `class_name` is the class of all
-    materials. If it is not given, it is the only class with as many columns. Raises `TableError` if there is no such
-    class, or more than one.
+    `params` (n, columns) are the parameters of the materials, and `values` (n, *grid.shape) are their tables. `walks`
+    (n,) has the number of random walks of each material. `error` has the standard error of each value, or is None.
+    `class_name` is the class of all materials. If it is not given, it is the only class whose parameters have as many
+    columns as `params`. Raises `TableError` if there is no such class, or more than one.
     """
 
     params: NDArray[np.float64]
@@ -94,14 +97,16 @@ class Tables:
         return 2.0 * math.pi * self.values.mean(axis=(-3, -2), dtype=np.float64)
 
     def __getitem__(self, chosen: slice | NDArray) -> Tables:
-        """The tables of the materials that a slice, or an array of indices, chooses."""
+        """The tables of some materials, given by a slice or by an array of indices."""
         error = None if self.error is None else self.error[chosen]
         return Tables(self.params[chosen], self.values[chosen], self.walks[chosen], error, self.class_name)
 
     @staticmethod
     def concatenate(parts: Sequence[Tables]) -> Tables:
-        """Joins tables of several materials. Raises `TableError` if their classes differ, or if only some of them have
-        standard errors."""
+        """Joins tables of several materials.
+
+        Raises `TableError` if their classes differ, or if only some of the tables have standard errors.
+        """
         classes = sorted({t.class_name for t in parts})
         if len(classes) > 1:
             raise TableError(
@@ -148,7 +153,7 @@ class Tables:
             raise TableError(f"{path}: no such file; `nma simulate` writes reference files") from None
         except (KeyError, ValueError, OSError, EOFError) as e:
             raise TableError(
-                f"{path}: not a reference file (.npz with params, table and walks): {e}"
+                f"{path}: not a reference file (.npz with the arrays params, table and walks): {e}"
             ) from None
         except Exception as e:  # zipfile and zlib raise their own exceptions for damaged archives
             raise TableError(f"{path}: damaged archive: {e}") from None
@@ -209,9 +214,10 @@ def _class_with(columns: int) -> str:
 
 
 def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | None = None) -> Tables:
-    """Loads the tables from the file `path`, or makes them with `make` and saves them there for the next run.
+    """Loads tables from the file `path`. If there is no such file, makes the tables with `make` and saves them there.
 
-    The tables are made again if the file is damaged, or if `params` are given and differ from those of the file.
+    The tables are made again if the file is damaged, or if `params` are given and differ from the parameters in the
+    file.
     """
     with suppress(TableError):
         found = Tables.load(path)
@@ -221,7 +227,8 @@ def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | N
     try:
         made.save(path)
     except OutputError:
-        # Another run for the same output may have ended and deleted the folder. `save` makes it again.
+        # Another run with the same output may have ended and deleted the folder between two steps of `save`. A second
+        # call of `save` makes the folder again.
         made.save(path)
     return made
 
@@ -238,10 +245,14 @@ def _check_arrays(
     if params.ndim != 2 or values.ndim not in (5, 6) or values.shape[0] != n or values.shape[-1] != 3:
         raise TableError(f"{path}: params {params.shape} and table {values.shape} do not belong together")
     if error is not None and error.shape != values.shape:
-        raise TableError(f"{path}: error has shape {error.shape}, table has {values.shape}")
+        raise TableError(f"{path}: error has shape {error.shape}, but table has shape {values.shape}")
     if walks.shape not in ((), (1,), (n,)) or not (walks > 0).all():
-        raise TableError(f"{path}: walks must be one positive number, or {n}; it has shape {walks.shape}")
+        raise TableError(
+            f"{path}: walks must be one positive number, or {n} positive numbers; its shape is {walks.shape}"
+        )
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             row = int(np.argwhere(~np.isfinite(array))[0][0])
-            raise TableError(f"{path}: {name} of material {row} is not finite; simulate it again")
+            raise TableError(
+                f"{path}: {name} of material {row} has values that are not finite; simulate the material again"
+            )

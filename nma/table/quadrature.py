@@ -1,4 +1,4 @@
-"""Points inside the bins of a table: for Average-vs-Average supervision (paper eq. 6), evaluation, and tabulation.
+"""Points inside the bins of a table, for Average-vs-Average supervision (paper eq. 6), evaluation and tabulation.
 
 A bin of 2e-3 sr is much wider than a sharp lobe, so uniform points would miss the lobe. The points of this module are
 denser near the mirror direction, at every scale down to the narrowest lobe. Each point has a weight, which makes the
@@ -16,8 +16,9 @@ from nma.jit import dr
 from nma.ops import Float, Vec3
 from nma.table.grid import ISOTROPIC, Grid
 
-# Points get denser towards the mirror direction down to the scale of this microfacet width. It is half the width of the
-# narrowest lobe: with coarser points, training makes such lobes too broad.
+# The density of points increases towards the mirror direction, down to the scale of a lobe of this microfacet width
+# (alpha). This is half the width of the narrowest lobe, because with coarser points training makes such lobes too
+# broad.
 FINEST = 0.0005
 
 
@@ -36,7 +37,7 @@ def shifted(x: Float, shift: Float) -> Float:
 
 
 def hashed(number: Any, seed: Any) -> Float:
-    """Hashes each 32-bit `number` to a Dr.Jit float in [0, 1). Jarzynski and Olano 2020, "pcg"."""
+    """Hashes each 32-bit `number` to a Dr.Jit float in [0, 1) (the hash "pcg" of Jarzynski and Olano 2020)."""
     state = (number ^ (seed * 0x9E3779B9)) * 747796405 + 2891336453
     word = ((state >> ((state >> 28) + 4)) ^ state) * 277803737
     return dr.auto.Float(((word >> 22) ^ word) >> 8) * (1.0 / 2**24)
@@ -48,8 +49,8 @@ def points(
     """Maps the point `u` of the unit cube to a pair of directions in the bin `place`.
 
     `place` is the bin's indices (theta_i, phi_i, theta_o, phi_o), as floats. For an isotropic grid, `u` has three
-    numbers and phi_i is ignored; for an anisotropic grid, `u` has four. Points get denser towards the mirror direction
-    down to lobes of width `finest`. If `finest` is None, they are uniform.
+    numbers and phi_i is ignored; for an anisotropic grid, `u` has four. The density of points increases towards the
+    mirror direction, down to the scale of a lobe of width `finest`. If `finest` is None, the density is uniform.
     """
     i, a, o, b = place
     if grid.phi_i:
@@ -91,8 +92,8 @@ def anisotropic_bin_points(
     """Maps the point `u` of the unit cube to the bin (theta_i, phi_i, theta_o, phi_o) = (i, a, o, b)."""
     near_mu, near_phi = _scales(i, grid, finest)
     mu_i, mu_o, weight = _cosines(i, o, u[0], u[1], grid, near_mu)
-    # psi is the difference of the azimuths minus pi, so it is 0 at the mirror direction, where points are denser. The
-    # bins' middles differ by `centre`, taken the shorter way round.
+    # psi is the azimuth of wo minus the azimuth of wi minus pi, so psi is 0 at the mirror direction, where points are
+    # denser. `centre` is psi for the middles of the two bins, as an angle from -pi to pi.
     step_i, step_o = 2.0 * math.pi / grid.phi_i, 2.0 * math.pi / grid.phi_o
     centre = (b + 0.5) * step_o - (a + 0.5) * step_i
     centre = centre - (2.0 * math.pi) * ops.floor(centre * (0.5 * ops.INV_PI)) - math.pi
@@ -104,14 +105,17 @@ def anisotropic_bin_points(
 
 
 def _scales(i: Float, grid: Grid, finest: float) -> tuple[Float, Float]:
-    """How far a lobe of width `finest` reaches from the mirror direction, as (cosine, azimuth [rad])."""
+    """The extent of a lobe of width `finest` around the mirror direction, as (extent in cosine, in azimuth [rad])."""
     mu = (i + 0.5) * (1.0 / grid.theta_i)
     sin = ops.sqrt(1.0 - mu * mu)
     return (2.0 * finest) * sin + 1e-5, ops.minimum((2.0 * finest) * mu / sin, 1.0)
 
 
 def _cosines(i: Float, o: Float, u: Float, v: Float, grid: Grid, scale: Float) -> tuple[Float, Float, Float]:
-    """Draws (cos(theta_i), cos(theta_o), weight). The cosines' difference is denser around 0, its mirror value."""
+    """Draws (cos(theta_i), cos(theta_o), weight).
+
+    Small differences of the cosines are more probable, because the difference is 0 at the mirror direction.
+    """
     width_i, width_o = 1.0 / grid.theta_i, 1.0 / grid.theta_o
     centre = ((o + 0.5) * (grid.theta_i / grid.theta_o) - (i + 0.5)) * width_i
     mu, s, weight = _pair(u, v, (i * width_i, width_i), (o * width_o, width_o), centre, scale)
@@ -122,7 +126,7 @@ def _cosines(i: Float, o: Float, u: Float, v: Float, grid: Grid, scale: Float) -
 def _pair(
     u: Float, v: Float, x: tuple[Float, float], y: tuple[Float, float], centre: Float, scale: Float
 ) -> tuple[Float, Float, Float]:
-    """Draws a number from the bin `x` and one from the bin `y`, such that their difference is denser around 0.
+    """Draws a number from the bin `x` and a number from the bin `y`, with a higher density where they differ less.
 
     Returns (number in `x`, number in `y` minus number in `x`, weight). A bin is given as (lower end, width). `centre`
     is the middle of `y` minus the middle of `x`.
@@ -130,8 +134,8 @@ def _pair(
     (low_x, width_x), (low_y, width_y) = x, y
     reach = 0.5 * (width_x + width_y)
     s, density = _crowd(u, centre - reach, centre + reach, scale)
-    # The numbers of `x` that can have the difference s to a number in `y` form an interval of this length. As a
-    # function of s, the length is a triangle, or a trapezoid if the widths differ.
+    # `room` is the length of the interval of numbers in `x` for which `y` contains a number that is larger by s. As a
+    # function of s, `room` has the shape of a triangle, or of a trapezoid if the widths of the bins differ.
     room = ops.minimum(reach - ops.absolute(s - centre), min(width_x, width_y))
     room = ops.maximum(room, 1e-7 * width_x)
     # Draw the number in `x` uniformly from that interval.
@@ -140,14 +144,17 @@ def _pair(
 
 
 def _directions(mu_i: Float, mu_o: Float, psi: Float) -> tuple[Vec3, Vec3]:
-    """wi at azimuth 0 and wo at azimuth pi - psi. These formulas give precise half vectors near the normal."""
+    """wi at azimuth 0 and wo at azimuth pi - psi.
+
+    The formulas are chosen such that half vectors near the normal are precise.
+    """
     sin_i = ops.safe_sqrt((1.0 - mu_i) * (1.0 + mu_i))
     sin_o = ops.safe_sqrt((1.0 - mu_o) * (1.0 + mu_o))
     return Vec3(sin_i, 0.0 * mu_i, mu_i), Vec3(-sin_o * ops.cos(psi), sin_o * ops.sin(psi), mu_o)
 
 
 def _turned(w: Vec3, phi: Float) -> Vec3:
-    """The direction turned by `phi` about the normal."""
+    """The direction `w`, rotated by `phi` about the normal."""
     cos_phi, sin_phi = ops.cos(phi), ops.sin(phi)
     return Vec3(cos_phi * w.x - sin_phi * w.y, sin_phi * w.x + cos_phi * w.y, w.z)
 
@@ -170,7 +177,7 @@ def _crowd(u: Float, low: Float, high: Float, scale: Float) -> tuple[Float, Floa
 def uniform_bin_points(
     i: Float, o: Float, p: Float, u: tuple[Float, Float, Float], grid: Grid = ISOTROPIC
 ) -> Points:
-    """Maps the point `u` of the unit cube to the bin (i, o, p) with uniform density, as the paper does."""
+    """Like `bin_points`, but the points have a uniform density in the bin, as in the paper."""
     mu_i = ops.clip((i + u[0]) * (1.0 / grid.theta_i), 1e-6, 1.0)
     mu_o = ops.clip((o + u[1]) * (1.0 / grid.theta_o), 1e-6, 1.0)
     psi = (grid.phi_o - p - u[2]) * (math.pi / grid.phi_o)
@@ -180,7 +187,7 @@ def uniform_bin_points(
 def uniform_anisotropic_bin_points(
     i: Float, a: Float, o: Float, b: Float, u: tuple[Float, Float, Float, Float], grid: Grid
 ) -> Points:
-    """Maps the point `u` of the unit cube to the bin (i, a, o, b) with uniform density."""
+    """Like `anisotropic_bin_points`, but the points have a uniform density in the bin."""
     mu_i = ops.clip((i + u[0]) * (1.0 / grid.theta_i), 1e-6, 1.0)
     mu_o = ops.clip((o + u[1]) * (1.0 / grid.theta_o), 1e-6, 1.0)
     phi_i, phi_o = (a + u[2]) * (2.0 * math.pi / grid.phi_i), (b + u[3]) * (2.0 * math.pi / grid.phi_o)

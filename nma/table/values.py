@@ -1,7 +1,7 @@
-"""Tables of sources that can be evaluated (`Values`), and tables used as such sources.
+"""Makes tables of sources that can be evaluated (`Values`), and evaluates tables as such sources.
 
-The value of a bin is the mean of f cos(theta_o) over fixed points in the bin. A table, too, can be evaluated: every
-pair of directions has the value of its bin.
+The value of a bin is the mean of f cos(theta_o) over fixed points in the bin. A table can be evaluated, too: every pair
+of directions has the value of the bin that contains it.
 """
 
 from __future__ import annotations
@@ -23,38 +23,41 @@ from nma.sources.lookup import Lookup
 from nma.table import quadrature
 from nma.table.grid import ISOTROPIC, Grid, Tables
 
-# The default number of points per bin. Bins near the mirror direction get `_NEAR` times more points, which are denser
-# towards it. There are few such bins, and they hold the peaks of smooth materials.
+# The default number of points per bin. Bins near the mirror direction get `_NEAR` times as many points, with a density
+# that increases towards the mirror direction. Such bins are few, and they contain the peaks of smooth materials.
 POINTS = 128
 _NEAR = 32
-# A bin is near if its elevation is within this many bins of the mirror direction's.
+# A bin counts as near if its theta_o is less than this many bins from the mirror direction.
 _REACH = 4.5
 
 # A bin's points are divided into this many independent sets. The spread of the sets' means gives the standard error.
 _SETS = 4
-# The number of points is a multiple of this, so that the sets are equal and each has whole pairs in both mirror halves.
+# The number of points must be a multiple of this. Then all sets have equally many points, and the points of each set
+# form equally many pairs in both mirror halves of a bin.
 _MULTIPLE = 16
 # Points stay this fraction of a bin's width away from its edges, so that rounding moves none into the next bin.
 _EDGE = 1e-5
 
-# Weights with a smaller variance count as equal: only rounding makes them differ.
+# If the variance of the weights is smaller than this, the weights count as equal, because only rounding makes them
+# differ.
 _UNWEIGHTED = 1e-4
 
-# The most bins in one kernel launch. It limits the memory and does not change the result.
+# The most bins in one kernel launch. This number limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 20
 
-# The number of walks that a table without any noise reports.
+# The number of walks (`walks`) of a table without any noise.
 _NOISELESS = 1 << 40
 
 
 def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POINTS) -> Tables:
     """The table of one source. Its `params` have the shape (1, 0).
 
-    A bin's value is the mean over `points` points (a multiple of 16), evenly spread in the bin. Near the mirror
-    direction there are 32 times more points, which get denser down to the narrowest lobe. Equal arguments give equal
-    tables. `error` is the standard error, estimated from four independent sets of points. It does not include rounding
-    or errors of the source itself, such as the noise of a measurement. `walks` is the number of random walks that would
-    give the median bin the same error, at most 2^40.
+    A bin's value is the mean over `points` points (a multiple of 16), evenly spread in the bin. Bins near the mirror
+    direction have 32 times as many points, with a density that increases towards the mirror direction, down to the
+    scale of the narrowest lobe. Equal arguments give equal tables. The table's `error` is the standard error, estimated
+    from four independent sets of points. This error does not include rounding, nor errors of the source itself, such as
+    the noise of a measurement. The table's `walks` is the number of random walks that would give a bin the same error:
+    the median over all bins, at most 2^40.
 
     Raises `TableError` for an anisotropic source on an isotropic grid, for a wrong number of points, and for values
     that are not finite.
@@ -83,7 +86,8 @@ def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
     """Marks the bins whose wo may be close to the mirror direction of their wi."""
     i, a, o, b = _indices(bins, grid)
     near_o = _apart(i, grid.theta_i, o, grid.theta_o) < _REACH
-    # If both directions are close to the normal, so is the half vector, whatever the azimuths are.
+    # If both directions are close to the normal, the half vector is close to it, too, whatever the azimuths are. So
+    # these bins count as near the mirror direction at every azimuth.
     top = (i == grid.theta_i - 1) & (o == grid.theta_o - 1)
     if not grid.phi_i:
         return near_o & (b >= grid.phi_o - 2) | top
@@ -91,9 +95,9 @@ def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _apart(a: NDArray, n: int, b: NDArray, m: int, periodic: bool = False) -> NDArray[np.float64]:
-    """Distance between the middle of bin `a` of `n` and that of bin `b` of `m`, in mean bin widths.
+    """Distance from the middle of bin `a` (of `n` bins) to the middle of bin `b` (of `m` bins), in mean bin widths.
 
-    Both grids divide the same interval.
+    The `n` bins and the `m` bins divide the same interval.
     """
     distance = (a + 0.5) / n - (b + 0.5) / m
     if periodic:
@@ -102,7 +106,7 @@ def _apart(a: NDArray, n: int, b: NDArray, m: int, periodic: bool = False) -> ND
 
 
 def _indices(bins: Any, grid: Grid) -> tuple[Any, Any, Any, Any]:
-    """The indices (theta_i, phi_i, theta_o, phi_o) of flattened bins, in NumPy or Dr.Jit.
+    """The indices (theta_i, phi_i, theta_o, phi_o) of bins, from their flat indices, in NumPy or Dr.Jit.
 
     In isotropic grids phi_i is 0.
     """
@@ -115,7 +119,7 @@ def _indices(bins: Any, grid: Grid) -> tuple[Any, Any, Any, Any]:
 def _means(
     values: Values, bins: NDArray, count: int, crowded: bool, grid: Grid
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Means and standard errors, each (bins, 3), from `_SETS` sets of `count` points per bin."""
+    """The mean and the standard error of each bin, both (bins, 3), from `_SETS` sets of `count` points per bin."""
     sets = np.stack([_moments(values, bins, count, crowded, grid, number) for number in range(_SETS)])
     finite = np.isfinite(sets).all(axis=(0, 2))
     if not finite.all():
@@ -123,8 +127,9 @@ def _means(
         place = (i, a, o, b) if grid.phi_i else (i, o, b)
         raise TableError(f"{values.name}: has values that are not finite, first in bin {place}")
     weight, square, value, product = sets[..., :1], sets[..., 1:2], sets[..., 2:5], sets[..., 5:]
-    # The weights are a control variate: their mean is known to be 1. Subtract the part of the mean that the deviation
-    # from 1 explains. Where values hardly change within a bin, their mean becomes almost exact, whatever the weights.
+    # The weights serve as a control variate, because their expected value is known to be 1. If the mean weight of a set
+    # is not 1, this deviation explains a part of the error of the mean value; the part is subtracted. If the source
+    # hardly changes within a bin, the mean value becomes almost exact.
     variance = np.mean(square - weight * weight, axis=0)
     covariance = np.mean(product - weight * value, axis=0)
     slope = np.where(variance > _UNWEIGHTED, covariance / np.maximum(variance, _UNWEIGHTED), 0.0)
@@ -138,8 +143,8 @@ def _moments(
 ) -> NDArray[np.float64]:
     """The means (bins, 8) of w, w^2, w f and w^2 f over one set of points; w is the weight and f the RGB value.
 
-    The points are those of a lattice, shifted at random for each bin, and their mirror images u -> 1 - u. The mirror
-    images make the means of linear functions exact.
+    The points are those of a lattice, shifted at random for each bin, and the mirror image 1 - u of each point u. The
+    mirror images make the means of linear functions exact.
     """
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     flat = UInt32(bins.astype(np.uint32))
@@ -166,11 +171,11 @@ def _moments(
 
 
 def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:
-    """The number of walks that would give a bin its error: the median over all bins."""
+    """The number of random walks that would give a bin its standard error: the median over all bins."""
     noisy = (mean > 0) & (error > 0)
     if not noisy.any():
         return _NOISELESS
-    # Counting statistics: error^2 = mean * rows / (walks * solid angle).
+    # For random walks, counting statistics give error^2 = mean * rows / (walks * solid angle).
     walks = (
         mean[noisy].astype(np.float64) * grid.rows / (error[noisy].astype(np.float64) ** 2 * grid.solid_angle)
     )
@@ -181,13 +186,16 @@ class TableValues:
     """A table as a source (`Values`): every pair of directions has the value of its bin.
 
     `tabulate_values` of this source gives the same table again. With `smooth`, values are interpolated linearly between
-    the middles of the bins. This avoids steps in pictures, but it widens peaks and changes the means.
+    the middles of the bins. Interpolation avoids steps in rendered images, but it widens peaks and changes the means
+    over bins.
     """
 
     def __init__(self, tables: Tables, number: int = 0, *, name: str = "table", smooth: bool = False):
-        """Takes material `number` of `tables`, counted from 0. Raises `TableError` if there is no such material."""
+        """Takes the table of the material with the index `number`. Raises `TableError` if there is no such material."""
         if not 0 <= number < len(tables.values):
-            raise TableError(f"{name}: no material {number} among its {len(tables.values)}")
+            raise TableError(
+                f"{name}: no material {number} among its {len(tables.values)} materials, counted from 0"
+            )
         table = tables.values[number]
         self.name, self.isotropic, self._smooth = name, table.ndim == 4, smooth
         self._sizes = table.shape[:-1]
@@ -203,13 +211,13 @@ class TableValues:
 
     @staticmethod
     def _isotropic(wi: Vec3, wo: Vec3) -> list[Float]:
-        """The position in a folded table, 0 .. 1 in each dimension."""
+        """The position of a pair of directions in an isotropic table, 0 .. 1 in each dimension."""
         azimuth = ops.atan2(wi.x * wo.y - wi.y * wo.x, wi.x * wo.x + wi.y * wo.y)
         return [wi.z, wo.z, ops.absolute(azimuth) * ops.INV_PI]
 
     @staticmethod
     def _anisotropic(wi: Vec3, wo: Vec3) -> list[Float]:
-        """The position in an anisotropic table, 0 .. 1 in each dimension."""
+        """The position of a pair of directions in an anisotropic table, 0 .. 1 in each dimension."""
         turns = [ops.atan2(w.y, w.x) * (0.5 * ops.INV_PI) for w in (wi, wo)]
         turns = [ops.select(t < 0, t + 1.0, t) for t in turns]
         return [wi.z, turns[0], wo.z, turns[1]]

@@ -19,9 +19,10 @@ from nma.table.grid import ISOTROPIC, Grid, Tables
 
 # Throughputs are summed as integers in units of 2^-16, because an integer sum does not depend on the order of addition.
 _UNIT = 65536.0
-# A 32-bit bin can count this many walks of throughput 1, with room for some throughputs above 1.
+# The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1, so a quarter
+# is left for throughputs above 1.
 _WALKS_PER_ROW = 49151
-# The most bins in one kernel launch, over all of its materials. It limits the memory and does not change the result.
+# The most bins of all materials in one kernel launch. This number limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 21
 
 
@@ -36,10 +37,10 @@ def tabulate(
 ) -> Tables:
     """The tables of n materials, each from at least `walks` random walks.
 
-    `params` (n, columns) are the materials' parameters. `keys` (n,), made by `stream_keys`, seed their random streams:
-    a material with the same key gets the same table, whichever other materials are in the call. If `error` is false,
-    the tables have no standard errors, which halves the memory. Raises `ParamError` if parameters are not physically
-    valid.
+    `params` (n, columns) are the materials' parameters. `keys` (n,), made by `stream_keys`, seed the random streams of
+    the materials. A material with the same key gets the same table, whatever other materials are in the call. If
+    `error` is false, the tables have no standard errors, which halves the memory that the call needs. Raises
+    `ParamError` if parameters are not physically valid.
     """
     params = source.space.check(params)
     if walks < 1 or len(keys) != len(params):
@@ -77,7 +78,7 @@ def _tabulate_group(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Values and standard errors, each (n, bins, 3), from a number of sweeps. A sweep is one walk from every row.
 
-    The sweeps are divided into launches short enough that no bin overflows.
+    The sweeps are divided into kernel launches that are short enough for the 32-bit counters of the bins.
     """
     moments = np.zeros((2 if error else 1, len(params), grid.bins, 3))
     for first in range(0, sweeps, _WALKS_PER_ROW):
@@ -86,7 +87,8 @@ def _tabulate_group(
     if not error:
         return moments[0] / weight, None
     sums, squares = moments
-    # If all walks of a row hit a bin with the same throughput, their variance is 0. Use that of a single hit instead.
+    # If all walks of a row end in one bin with the same throughput, their variance is 0. The variance of a single hit
+    # is used instead, so that the standard error is not 0.
     variance = np.maximum(squares - sums * sums / sweeps, squares / sweeps)
     return sums / weight, np.sqrt(variance) / weight
 
@@ -96,7 +98,7 @@ def _launch(
 ) -> NDArray:
     """The sums (1, n, bins, 3) of throughputs over the sweeps `first` .. `first + sweeps - 1`.
 
-    With `error`, also the sums of their squares: (2, n, bins, 3).
+    With `error`, the array also has the sums of the squared throughputs: (2, n, bins, 3).
     """
     Float, UInt32, UInt64 = dr.auto.Float, dr.auto.UInt32, dr.auto.UInt64
     n, sweeps, first = len(params), sweeps * max(grid.phi_i, 1), first * max(grid.phi_i, 1)
@@ -106,7 +108,7 @@ def _launch(
     columns = [dr.gather(Float, Float(np.ascontiguousarray(c, np.float32)), material) for c in params.T]
     gathered = source.gather(columns)
     key = dr.gather(UInt64, UInt64(keys), material)
-    # The random stream of a sweep depends only on the material's key and on the sweep's number.
+    # The random stream of a sweep depends only on the material's key and on the sweep's index.
     number = UInt64(sweep) + dr.opaque(UInt64, first)
     rng = dr.auto.PCG32(1, _mix(key ^ (number * 0x9E3779B97F4A7C15)), _mix(key + number))
     counters = [dr.zeros(UInt32, n * grid.bins * 3) for _ in range(2 if error else 1)]
@@ -125,7 +127,10 @@ def _mix(x: Any) -> Any:
 
 @dataclass
 class _State:
-    """The state of a lane in its sweep. A lane starts its next walk as soon as one has ended, so that no lane idles."""
+    """The state of a lane in its sweep.
+
+    A lane starts its next walk as soon as the previous walk has ended, so no lane idles.
+    """
 
     rng: Any
     row: Any
@@ -136,7 +141,10 @@ class _State:
 def _sweep(
     source: Source, params: Any, rng: Any, offset: Any, phi_row: Any, counters: list[Any], grid: Grid
 ) -> None:
-    """Runs one walk from every row of theta_i in every lane, and counts it in the lane's table, at `offset`."""
+    """In every lane, runs one walk from every row of theta_i.
+
+    The throughputs are added to the bins of the lane's table, whose first bin has the index `offset`.
+    """
     UInt32 = dr.auto.UInt32
 
     def begin(state: _State, fresh: Any) -> _State:
@@ -170,7 +178,7 @@ def _sweep(
 
 
 def bin_index(row: Any, phi_row: Any, wo: Vec3, grid: Grid) -> Any:
-    """The index, in a flattened table, of the bin that contains wo. `row` and `phi_row` are the bin of wi."""
+    """The flat index of the bin that contains wo. `row` and `phi_row` are the indices of the bin of wi."""
     UInt32 = dr.auto.UInt32
     o = dr.minimum(UInt32(dr.maximum(wo.z, 0.0) * grid.theta_o), grid.theta_o - 1)
     phi = ops.atan2(wo.y, wo.x)

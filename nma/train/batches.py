@@ -1,4 +1,7 @@
-"""Draws batches of bins from tables in memory, with NumPy. The batch of a step depends only on (seed, step)."""
+"""Draws batches of bins from tables in memory, with NumPy.
+
+The batch of a step depends only on the seed and the step.
+"""
 
 from __future__ import annotations
 
@@ -16,28 +19,31 @@ from nma.table import ISOTROPIC, Grid, Tables
 from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import Recipe
 
-# A stream replaces this many materials at once, enough to keep the lanes of the simulation busy.
+# A stream replaces this many materials at once, so that the simulation has enough walks to run in parallel.
 STREAM_BLOCK = 16
 
 
 class Batch(NamedTuple):
-    """The bins of one step. Rows are the last axis, so that values per row broadcast along contiguous memory."""
+    """The bins of one step.
+
+    The last axis of an array is that of the rows, so that values per row broadcast along contiguous memory.
+    """
 
     columns: NDArray[np.float32]  # (parameters, rows)
-    mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs, at a random place in the row
+    mu: NDArray[np.float32]  # (rows,) cos(theta_i) at which the network runs, random in the bin `i`
     phi: NDArray[np.float32]  # (rows,) azimuth of wi, 0 for isotropic tables
-    i: NDArray[np.float32]  # (rows,) bin of cos(theta_i)
-    a: NDArray[np.float32]  # (rows,) bin of phi, 0 for isotropic tables
-    o: NDArray[np.float32]  # (bins_per_row, rows)
-    p: NDArray[np.float32]  # (bins_per_row, rows)
+    i: NDArray[np.float32]  # (rows,) index of the bin of cos(theta_i)
+    a: NDArray[np.float32]  # (rows,) index of the bin of phi_i, 0 for isotropic tables
+    o: NDArray[np.float32]  # (bins_per_row, rows) index of the bin of cos(theta_o)
+    p: NDArray[np.float32]  # (bins_per_row, rows) index of the bin of the azimuth of wo
     shift: NDArray[np.float32]  # (3 or 4, bins_per_row, rows) random shift of the points' lattice
-    weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, corrects for the choice of bins
+    weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, corrects for the uneven choice of bins
     value: NDArray[np.float32]  # (3, bins_per_row, rows) values of the table
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at `mu`
     albedo_shift: NDArray[
         np.float32
     ]  # (3, 2, rows) random shifts of the samples that estimate the target's albedo
-    quantum: NDArray[np.float32]  # (rows,) the value that one walk of throughput 1 adds to a bin
+    quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to the value of a bin
 
 
 @dataclass
@@ -56,14 +62,15 @@ class Pool:
         return Pool(tables.params.astype(np.float32), tables.values, tables.walks, albedo, tables.grid)
 
     def bins(self, m: NDArray, i: NDArray, a: NDArray, o: NDArray, p: NDArray) -> NDArray:
-        """The values (..., 3) of some bins. Negative channels become 0: no BRDF is negative."""
+        """The values (..., 3) of some bins. Negative values become 0, because a BRDF is never negative."""
         rows = (m, i, a) if self.grid.phi_i else (m, i)
         return np.maximum(self.values[(*rows, o, p)], 0.0)
 
     def albedo_at(self, m: NDArray, i: NDArray, a: NDArray, mu: NDArray) -> NDArray:
         """The directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i` (and `a`).
 
-        It is linear within a row: it has the mean of the row, and the slope between the neighbouring rows.
+        The albedo is taken as linear within a row: its mean is that of the row, and its slope is that between the two
+        neighbouring rows.
         """
         last = self.grid.theta_i - 1
         above, below = np.minimum(i + 1, last), np.maximum(i - 1, 0)
@@ -77,8 +84,8 @@ class Pool:
 class Stream:
     """A pool of simulated materials. Every `refresh` steps, a block of new materials replaces the oldest block.
 
-    The pool of a step depends only on the settings and the step, so that a resumed run sees the same materials.
-    `settings.materials` is the size of the pool. Call it with steps in ascending order.
+    The pool of a step depends only on the settings and the step, so that a resumed run gets the same materials.
+    `settings.materials` is the size of the pool. A stream must be called with steps in ascending order.
     """
 
     def __init__(self, settings: Settings, refresh: int, first_step: int = 0):
@@ -87,7 +94,7 @@ class Stream:
         self._replaced = first_step // refresh
         oldest = self._replaced * self._block
         indices = np.arange(oldest, oldest + settings.materials)
-        # Material k is stored in slot k modulo the size.
+        # Material k is stored at the index k modulo the size of the pool.
         tables = simulate_block(settings, indices[np.argsort(indices % settings.materials)])
         self._pool = Pool.of(tables)
         self._pool.values = self._pool.values.astype(np.float16)
@@ -106,18 +113,18 @@ class Stream:
 
 
 class BinSampler:
-    """Chooses bins of wo for rows of wi, and returns the weight of each choice."""
+    """Chooses bins of wo for rows (bins of wi), and computes the weight of each choice."""
 
     def __init__(self, law: str, grid: Grid = ISOTROPIC):
         self.grid = grid
         self.uniform_share = 1.0 if law == "uniform" else 0.5
-        # Probabilities fall off like a Cauchy distribution over a few bins from the mirror direction, in each
-        # coordinate.
+        # In each coordinate, the probability of a bin is that of a Cauchy distribution around the mirror direction,
+        # with a scale of 1.5 bins.
         steps = np.arange(grid.theta_o)
         near_o = 1.0 / (1.0 + ((steps[None, :] - steps[:, None]) / 1.5) ** 2)
         self._o = near_o / near_o.sum(axis=1, keepdims=True)
-        # Distance in bins from the mirror direction. It is the last bin of isotropic tables, whose azimuths are folded;
-        # anisotropic tables have bins on both sides of it.
+        # Distance in bins from the azimuth of the mirror direction. In isotropic tables, whose azimuths are folded,
+        # this azimuth is in the last bin. Anisotropic tables have bins on both sides of this azimuth.
         steps = np.arange(grid.phi_o)
         steps = np.minimum(steps, grid.phi_o - steps) if grid.phi_i else grid.phi_o - 1 - steps
         near_p = 1.0 / (1.0 + (steps / 1.5) ** 2)
@@ -128,7 +135,10 @@ class BinSampler:
     def draw(
         self, rng: np.random.Generator, i: NDArray, a: NDArray, count: int
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Chooses bins for the rows with bins `i` and `a` (rows,): (o, p, weight), each (count, rows)."""
+        """Chooses `count` bins of wo for each row (`i`, `a`), where `i` and `a` are (rows,).
+
+        Returns (o, p, weight), each (count, rows).
+        """
         u = rng.random((2, count, len(i)))
         o = (u[0] * self.grid.theta_o).astype(np.int64)
         p = (u[1] * self.grid.phi_o).astype(np.int64)
@@ -145,11 +155,11 @@ class BinSampler:
         return o, p, 1.0 / (bins * density)
 
     def _mirror_o(self, i: NDArray) -> NDArray:
-        """The bin of theta_o that contains the mirror direction of the middle of bin `i`."""
+        """The index of the theta_o bin that contains the mirror direction of the middle of the theta_i bin `i`."""
         return (2 * i + 1) * self.grid.theta_o // (2 * self.grid.theta_i)
 
     def _mirror_p(self, a: NDArray) -> NDArray:
-        """The bin of phi_o that contains the mirror direction of the middle of bin `a`."""
+        """The index of the phi_o bin that contains the mirror direction of the middle of the phi_i bin `a`."""
         return (2 * a + 1) * self.grid.phi_o // (2 * self.grid.phi_i) + self.grid.phi_o // 2
 
 
@@ -183,7 +193,10 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
 
 
 def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> Iterator[tuple[int, Any]]:
-    """Yields (first step, stacked batches of `group` steps) from `start` to `stop`. A thread prepares them ahead."""
+    """Yields (first step, stacked batches of `group` steps) from `start` to `stop`.
+
+    A thread prepares the batches in advance.
+    """
     queue: Queue = Queue(maxsize=2)
     stopped = threading.Event()
 
@@ -207,7 +220,7 @@ def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> 
                 raise item
             yield item
     finally:
-        # If the consumer stops early, the thread must not wait for room in the queue forever.
+        # If the consumer stops early, the thread would wait forever for room in the queue, so the queue is emptied.
         stopped.set()
         while thread.is_alive():
             with suppress(Empty):

@@ -1,4 +1,4 @@
-"""Fits an adapter to a single material, given by its values or by a table of them (paper Fig. 4, 13)."""
+"""Fits an adapter to a single material, given as a source of values or as a table (paper Fig. 4, 13)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ Progress = Callable[[loop.Run], None]
 
 
 def recipe_for(source: Values | Tables, **changes: Any) -> Recipe:
-    """The recipe for a source: isotropic or anisotropic, with noise (tables) or without (values).
+    """The recipe for a source.
 
+    The recipe depends on whether the source is isotropic, and on whether the source is a table or has exact values.
     `changes` are fields of `Recipe`; the value None leaves a field unchanged.
     """
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -43,11 +44,11 @@ def fit(
 ) -> tuple[Adapter, loop.Run]:
     """Fits an adapter of class "measured", which has no parameters, to one material. Returns the adapter and the run.
 
-    Sources of values are compared with the target point by point, and tables bin by bin. The default recipe is
+    The target is compared with a source of values point by point, and with a table bin by bin. The default recipe is
     `recipe_for(source)`. `record` says where the source comes from and is stored with the weights. `progress` is called
-    during training; without it, a progress bar is shown on stderr if that is a terminal (`lambda run: None` shows
-    nothing). Raises `NmaError` if only one of recipe and source is isotropic, and `TableError` for tables of several
-    materials.
+    during training. If `progress` is None, a progress bar is shown on stderr if stderr is a terminal; `lambda run:
+    None` shows nothing. Raises `NmaError` if only the recipe or only the source is isotropic, and `TableError` if a
+    table has several materials.
     """
     recipe = recipe or recipe_for(source)
     with of_training(progress, recipe, "fitting") as show:
@@ -62,7 +63,7 @@ def _fit_values(
     _check_isotropy(source.name, source.isotropic, recipe)
     if recipe.loss != "log":
         raise NmaError(
-            f"{source.name} has values without noise; they need the loss 'log', not '{recipe.loss}'"
+            f"{source.name} has values without noise, so the recipe's loss must be 'log', not '{recipe.loss}'"
         )
     pool = PointPool.of(source, seed=recipe.seed)
     run = loop.start(recipe, initial_layers(recipe, MEASURED), record)
@@ -81,7 +82,9 @@ def _fit_table(
     tables: Tables, recipe: Recipe, record: dict[str, Any], progress: Progress, budget_seconds: float
 ) -> tuple[Adapter, loop.Run]:
     if len(tables.values) != 1:
-        raise TableError(f"a fit is for one material, the table has {len(tables.values)}; choose one")
+        raise TableError(
+            f"a fit is for one material, but the table has {len(tables.values)} materials; choose one of them"
+        )
     _check_isotropy("the table", not tables.grid.phi_i, recipe)
     unnamed = Tables(tables.params[:, :0], tables.values, tables.walks, None, MEASURED.name)
     return train_class(MEASURED, recipe, unnamed, record, progress=progress, budget_seconds=budget_seconds)

@@ -1,4 +1,4 @@
-"""Trains a library (codes and network together), and learns the code of another material."""
+"""Trains a library (a network and a code for each material), and finds the code of a new material."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nma.train.loss import bin_means, brdf_of, distance, loss
 from nma.train.recipe import Recipe
 from nma.train.run import adapter_of, initial_layers
 
-# Training takes 20 minutes or less on two cores for a hundred materials, tables included.
+# With this recipe, a library of a hundred materials takes 20 minutes or less on two cores, including the tables.
 RECIPE = Recipe(
     network="3x32",
     encoding="raw",
@@ -38,14 +38,14 @@ RECIPE = Recipe(
     steps=60_000,
 )
 
-# For learning one code. The network is fixed, so a thousand steps are enough.
+# The recipe for finding one code. The network is fixed, so a thousand steps are enough.
 ENCODING = replace(RECIPE, learning_rate=3e-2, average=0.99, steps=1_000)
 
 # The search for a code starts at the codes of this many materials, and at the mean of all codes.
 NEAREST = 3
 # Standard deviation of the codes before training.
 _SPREAD = 0.5
-# Number of batches on which codes are compared.
+# Number of batches on which the log losses of codes are compared.
 _JUDGED = 8
 
 
@@ -59,14 +59,15 @@ def train_library(
     progress: Callable[[loop.Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Library, loop.Run]:
-    """Learns the network of a library, and the code of each of its materials. Returns the library and the run.
+    """Trains the network of a library, and the code of each material. Returns the library and the run.
 
     `record` says where the tables come from and is stored with the weights. A checkpoint with another record is
-    refused.
+    rejected.
     """
     if len(names) != len(tables.values) or tables.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
-            f"a library of {len(names)} materials needs as many tables {ISOTROPIC.shape}, got {tables.values.shape}"
+            f"a library of {len(names)} materials needs {len(names)} tables of shape {ISOTROPIC.shape}, "
+            f"got {tables.values.shape}"
         )
     rng = np.random.default_rng((recipe.seed, 0xC0DE))
     free = _SPREAD * rng.standard_normal((len(names), LIBRARY.size))
@@ -94,7 +95,8 @@ def train_library(
 class Encoded:
     """The code (32,) of a new material, and its log loss over the bins of the table.
 
-    `nearest` is the library's material with the lowest log loss on the same table, which is `nearest_log_loss`.
+    `nearest` is the library's material whose code has the lowest log loss on the same table, and `nearest_log_loss` is
+    this log loss.
     """
 
     code: NDArray[np.float32]
@@ -110,13 +112,13 @@ def encode(
     recipe: Recipe = ENCODING,
     progress: Callable[[loop.Run], None] | None = None,
 ) -> Encoded:
-    """Learns the code of the one material in `tables`. The network does not change.
+    """Finds the code of the one material in `tables`. The network does not change.
 
-    The search runs from the mean code and from the codes of the nearest materials at once, and keeps the best result.
-    Without `progress`, a progress bar is shown on stderr if that is a terminal.
+    The search starts from the mean code and from the codes of the nearest materials, all at the same time, and returns
+    the best code. Without `progress`, a progress bar is shown on stderr if stderr is a terminal.
     """
     if tables.values.shape != (1, *ISOTROPIC.shape):
-        raise TableError(f"one table {ISOTROPIC.shape} is encoded at a time, got {tables.values.shape}")
+        raise TableError(f"encoding needs one table of shape {ISOTROPIC.shape}, got {tables.values.shape}")
     adapter = library.adapter
     recipe = replace(
         recipe, instances=adapter.instances, directional=adapter.directional, bounded=adapter.bounded
@@ -130,7 +132,7 @@ def encode(
         batches = _source(_repeated(tables, len(starts)), recipe)
         loop.train(recipe, run, batches, objective=_held, progress=show)
     found = np.asarray(code_of(loop.result(run, recipe)[0]))
-    # The nearest code may already be the best.
+    # The code of the nearest material is a candidate, too, because the search may end at worse codes.
     found = np.concatenate([found, library.codes[near[:1]]])
     best = found[np.argmin(_judge(found, library, tables, recipe))]
     log_losses = [table_log_loss(adapter, code, tables.values[0]) for code in (best, library.codes[near[0]])]
@@ -138,27 +140,31 @@ def encode(
 
 
 def code_of(free: Any) -> Any:
-    """Codes from the free variables of the optimisation.
+    """Converts the free variables of the optimisation to codes.
 
-    Free variables are any real numbers. Codes lie within the class's range; near 0 they almost equal the variables.
+    Free variables may be any real numbers. Codes lie within the range of the class; near 0 a code almost equals its
+    variable.
     """
     return CODE_BOUND * jnp.tanh(free * (1.0 / CODE_BOUND))
 
 
 def free_of(code: NDArray) -> NDArray:
-    """The inverse of `code_of`. Codes are first kept away from the ends of the range, where gradients vanish."""
+    """The inverse of `code_of`. Codes are first moved away from the ends of the range, where gradients vanish."""
     return CODE_BOUND * np.arctanh(np.clip(code / CODE_BOUND, -0.99, 0.99))
 
 
 def objective(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The loss for weights (free variables of the codes, layers). The batch's column holds indices of materials."""
+    """The loss of the weights (free variables of the codes, layers).
+
+    The batch's only column has each row's material index.
+    """
     free, layers = weights
     codes = code_of(free)[batch.columns[0].astype(jnp.int32)]
     return loss(layers, batch._replace(columns=codes.T), recipe)
 
 
 def _held(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """As `objective`, without gradients for the network."""
+    """The same as `objective`, but without gradients for the network."""
     free, layers = weights
     return objective((free, jax.lax.stop_gradient(layers)), batch, recipe)
 
@@ -177,7 +183,7 @@ def _repeated(tables: Tables, count: int) -> Tables:
 
 
 def _judge(codes: NDArray, library: Library, tables: Tables, recipe: Recipe) -> NDArray[np.float32]:
-    """The log loss (n,) of each code, over the same few bins for all codes."""
+    """The log losses (n,) of the codes, for all codes over the same few bins."""
     source = _source(tables, replace(recipe, seed=recipe.seed + 1))
     batches = Batch(*(np.stack(parts) for parts in zip(*map(source, range(_JUDGED)), strict=True)))
     layers = library.adapter.layers

@@ -21,17 +21,17 @@ from nma.train.batches import batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
 
-# The arrays to train, in any JAX tree; for an adapter they are `nma.network.Layers`.
+# The arrays to train, in any JAX tree. For an adapter, the tree is `nma.network.Layers`.
 Weights = Any
 # A named tuple of arrays, such as `nma.train.batches.Batch`.
 Batch = Any
-# (weights, batch, recipe) -> (the loss to minimise, the log loss to report).
+# A function of (weights, batch, recipe), which returns (the loss to minimise, the log loss to report).
 Objective = Callable[[Weights, Batch, Recipe], tuple[jax.Array, jax.Array]]
 
-# Steps per call of the compiled function.
+# Number of steps per call of the compiled function (a group).
 GROUP = 50
 _CHECKPOINT_SECONDS = 60.0
-# The plateau schedule compares means of the loss over windows of this many groups.
+# The schedule "plateau" compares the mean losses of two successive windows. A window has this many groups.
 _PATIENCE = 6
 _MIN_SCALE = 1e-3
 
@@ -48,7 +48,8 @@ class State(NamedTuple):
 class Run:
     """The progress of a training run: steps done, losses so far (one per step), and time spent.
 
-    `scale` multiplies Adam's steps (schedule "plateau"). `record` says where the training data come from.
+    `scale` multiplies Adam's steps; only the schedule "plateau" changes it. `record` says where the training data come
+    from.
     """
 
     state: State
@@ -61,7 +62,7 @@ class Run:
 
 
 def start(recipe: Recipe, layers: Weights, record: dict[str, Any] | None = None) -> Run:
-    """A new run, before its first step; `record` says where its data come from."""
+    """A new run, before its first step; `record` says where the training data come from."""
     layers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), layers)
     return Run(State(layers, layers, _optimiser(recipe).init(layers)), record=record or {})
 
@@ -110,7 +111,7 @@ def train(
 
 
 def result(run: Run, recipe: Recipe) -> Weights:
-    """The trained weights as NumPy arrays; they are the averaged weights if the recipe averages."""
+    """The trained weights as NumPy arrays. If the recipe's `average` is above 0, they are the averaged weights."""
     return jax.tree.map(np.asarray, run.state.averaged if recipe.average > 0 else run.state.layers)
 
 
@@ -130,7 +131,7 @@ def _optimiser(recipe: Recipe) -> optax.GradientTransformation:
 def _group(
     state: State, group: Batch, scale: float, recipe: Recipe, objective: Objective
 ) -> tuple[State, jax.Array]:
-    """Does the steps of one group. Returns the new state, and (steps, 2): loss and log loss of each step."""
+    """Runs the steps of one group. Returns the new state, and the loss and log loss of each step (steps, 2)."""
     optimiser = _optimiser(recipe)
 
     def step(state: State, batch: Batch) -> tuple[State, jax.Array]:
@@ -144,7 +145,7 @@ def _group(
 
 
 def _plateau(run: Run) -> float:
-    """The scale of the next steps: halved when a window's mean loss is not 1 % below that of the window before."""
+    """The scale of the next steps. It is halved if the mean loss has not fallen by 1 % from one window to the next."""
     window = _PATIENCE * GROUP
     if run.step % window or run.step < 2 * window:
         return run.scale
@@ -185,11 +186,12 @@ def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] |
     if notes["recipe"] != asdict(recipe):
         changed = [k for k, v in asdict(recipe).items() if notes["recipe"].get(k) != v]
         raise NmaError(
-            f"{path} belongs to a run with other settings ({', '.join(changed)}); delete it, or restore them"
+            f"{path} belongs to a run with other settings ({', '.join(changed)}); "
+            "delete the file, or restore the settings"
         )
     if notes.get("record", {}) != run.record:
         raise NmaError(
-            f"{path} belongs to a run on other data, {notes.get('record')}; delete it, or use the same data"
+            f"{path} belongs to a run on other data, {notes.get('record')}; delete the file, or use the same data"
         )
     state = jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(x) for x in leaves])
     return Run(state, notes["step"], losses, log_losses, notes["seconds"], notes["scale"], run.record)

@@ -20,12 +20,12 @@ from nma.target import Brdf
 from nma.train.batches import Batch
 from nma.train.recipe import Recipe
 
-# The Huber loss treats residuals of the logarithm up to this size as noise, even in bins with hardly any noise.
+# The Huber loss is quadratic for residuals of the logarithm up to this size, even in a bin with hardly any noise.
 _TOLERANCE = 0.003
 
 
 def network_outputs(layers: Layers, batch: Any, recipe: Recipe) -> jax.Array:
-    """The raw outputs (rows, outputs) of the network, which runs once per row, at the cosine `mu` of the row."""
+    """The raw outputs (rows, outputs) of the network. The network runs once per row, at the row's `mu`."""
     wi = view(batch)
     inputs = encoding.get(recipe.encoding)(list(batch.columns), wi if recipe.directional else None)
     return network.forward(layers, jnp.stack([jnp.broadcast_to(x, batch.mu.shape) for x in inputs], axis=-1))
@@ -34,7 +34,7 @@ def network_outputs(layers: Layers, batch: Any, recipe: Recipe) -> jax.Array:
 def brdf_of(layers: Layers, batch: Any, recipe: Recipe) -> Brdf:
     """The target of each row, with parameters (rows,).
 
-    Isotropic batches have wi at the azimuth 0, where the frame of the plane of incidence is the local frame.
+    In isotropic batches wi has azimuth 0, so the frame of the plane of incidence equals the local frame.
     """
     raw = network_outputs(layers, batch, recipe)
     blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
@@ -66,9 +66,10 @@ def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
 
 
 def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
-    """Two independent unbiased estimates of the target's directional albedo, (2, 3, rows), from its own samples.
+    """Two independent unbiased estimates (2, 3, rows) of the target's directional albedo, from samples of its lobes.
 
-    Derivatives treat the samples as constants. The derivatives are therefore unbiased, and no estimate is clipped.
+    Derivatives treat the sampled directions and their densities as constants. The derivatives are therefore unbiased,
+    too. Estimates are not clipped, because clipping would bias them.
     """
     lattice = jnp.asarray(lattice_points(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
@@ -94,24 +95,26 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     """The squared error of the directional albedo, times its weight in the recipe."""
     if not recipe.albedo > 0:
         return 0.0
-    # The mean of the product of two independent errors is the squared error, without the variance of the estimates.
+    # The two estimates are independent. Therefore the mean of the product of their errors is the squared error, without
+    # the variance of the estimates.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 
 
 def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The recipe's distance, and the log loss, between bin means (3, bins_per_row, rows) and the tables."""
+    """The recipe's distance and the log loss, both between bin means (3, bins_per_row, rows) and the tables."""
     residual = jnp.log1p(mean) - jnp.log1p(batch.value)
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":
         return log_loss, log_loss
-    # Counting noise of the bin under the model: about mean / quantum walks hit the bin. It is at least that of one
-    # walk.
+    # sigma is the standard error of the logarithm, from counting statistics. If the target is right, about expected /
+    # quantum walks end in the bin. One walk is added, so that sigma is never 0.
     expected = jax.lax.stop_gradient(mean)
     sigma = jnp.sqrt(batch.quantum * (expected + batch.quantum)) / (1.0 + expected)
     width = 3.0 * sigma + _TOLERANCE
     size = jnp.abs(residual)
     huber = jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)
-    # An error d of the logarithm is an error (1 + value) d of the value itself.
+    # `emphasis` adds the error of the value itself, with the weight `energy`: an error d of log(1 + value) is an error
+    # of about (1 + value) d of the value.
     emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
     return (huber * emphasis * batch.weight).mean(), log_loss

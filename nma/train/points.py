@@ -1,7 +1,8 @@
 """Training data for sources whose values are known (`Values`): their values at pairs of directions.
 
-For a table only the averages of bins are known, so the target must be averaged over bins. Where values are known, the
-target is compared with the source at each pair of directions, which needs an eighth of the evaluations.
+A table has only the averages over bins, so for a table the target must be averaged over bins. A source with known
+values is compared with the target at single pairs of directions, which needs an eighth of the evaluations of the
+target.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from nma.target.sampling import sample_spec
 from nma.train.loss import albedo_loss, brdf_of, view
 from nma.train.recipe import Recipe
 
-# Number of view directions of the pool, and of directions wo for each view direction.
+# Number of directions wi of the pool (rows), and number of directions wo for each direction wi.
 ROWS, POINTS = 8192, 512
-# One direction wo in this many is drawn near the mirror direction; the others are uniform. This is enough to find
-# narrow lobes. It is not more because smooth parts of the material are learned less well from these directions.
+# One of this many directions wo is drawn near the mirror direction; the other directions are uniform. A share of a
+# quarter is enough to find narrow lobes. A larger share would make the fit of smooth parts of the material worse.
 _CROWDED = 4
 # Widths (alpha) of the microfacet lobes from which the directions near the mirror direction are drawn.
 _WIDTHS = tuple(0.0005 * 2.0**k for k in range(11))
-# Number of rows that are evaluated at once, which bounds the memory.
+# Number of rows that are evaluated at once. It limits the memory.
 _ROWS_PER_LAUNCH = 2048
 
 
@@ -44,7 +45,7 @@ class PointBatch(NamedTuple):
     mu: NDArray[np.float32]  # (rows,) cos(theta_i)
     phi: NDArray[np.float32]  # (rows,) azimuth of wi
     wo: NDArray[np.float32]  # (3, points, rows)
-    weight: NDArray[np.float32]  # (points, rows) mean 1, corrects for the uneven density of wo
+    weight: NDArray[np.float32]  # (points, rows) weights of mean 1, for the uneven density of wo
     value: NDArray[np.float32]  # (3, points, rows)
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at wi
     albedo_shift: NDArray[
@@ -90,7 +91,7 @@ class PointPool:
         """The points of one step: random rows, and random points of each row."""
         rng = np.random.default_rng((recipe.seed, step, 0x90))
         m = rng.integers(len(self.mu), size=recipe.rows)
-        # The points are consecutive, because every _CROWDED-th point is one near the mirror direction.
+        # The points of a row are consecutive, so that every _CROWDED-th of them is near the mirror direction.
         count = recipe.bins_per_row * recipe.points
         k = (
             rng.integers(self.weight.shape[1], size=recipe.rows) + np.arange(count)[:, None]
@@ -110,7 +111,7 @@ class PointPool:
 def _evaluated(
     source: Values, mu: NDArray, phi: NDArray, shift: NDArray, points: int
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Evaluates some rows: wo (3, rows, points), weight (rows, points), value (3, rows, points)."""
+    """Evaluates the source in some rows: wo (3, rows, points), weight (rows, points), value (3, rows, points)."""
     Float = dr.auto.Float
 
     def lanes(x: NDArray) -> Any:

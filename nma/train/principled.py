@@ -1,4 +1,7 @@
-"""Fits one Principled BRDF with constant parameters to a material: no network, no dependence on direction, no blend."""
+"""Fits one Principled BRDF with constant parameters to a material.
+
+The parameters do not depend on the direction, so no network is needed. The result is a single BRDF, not a blend.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +26,16 @@ from nma.train.loss import brdf_loss
 from nma.train.recipe import Recipe
 from nma.train.run import record_of
 
-# The paper's 11 parameters and `flatness`, the fake subsurface. `anisotropic` stays 0, because tables of isotropic
-# materials say nothing about it.
+# The paper's 11 parameters and `flatness`, the fake subsurface. `anisotropic` stays 0, because isotropic tables cannot
+# determine this parameter.
 CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
 
-# Few bins with many points each. Eq. 7 counts the noise of a bin's average as an error, so fits would avoid lobes whose
-# averages are noisy. A Principled BRDF fitted to its own table ended at a log loss of .0023 with 4 points per bin, and
-# at .00015 with 64; the best possible is .00014. The log loss alone neglects bright, narrow lobes: copper under a blue
-# medium and a smooth coat became 14 % too dark. With this weight of the albedo it became 1 % too dark, at a log loss of
-# .0172 instead of .0145.
+# A step has few bins, but many points in each bin. With few points, the averages of narrow lobes are noisy. Eq. 7
+# counts this noise as an error, so fits would avoid narrow lobes. A Principled BRDF fitted to its own table ended at a
+# log loss of .0023 with 4 points per bin, and at .00015 with 64 points; the best possible log loss is .00014. The log
+# loss alone neglects bright, narrow lobes: fitted without the albedo error, copper under a blue medium and a smooth
+# coat became 14 % too dark. With `albedo` = 1 (the weight of the albedo error), the same material became 1 % too dark,
+# at a log loss of .0172 instead of .0145.
 CONSTANT = Recipe(
     network="none",
     instances=1,
@@ -47,8 +51,8 @@ CONSTANT = Recipe(
     steps=800,
 )
 
-# Starting points of the fits; there are several because the loss has many local minima. The base colour comes from the
-# table.
+# Starting points of the fits. There are several, because the loss has many local minima. The base colour of each is
+# replaced by the mean albedo of the table.
 _GREY = Color(0.5, 0.5, 0.5)
 _STARTS = {
     "diffuse": Principled(_GREY, 0.6, 0.05, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
@@ -58,16 +62,16 @@ _STARTS = {
     "smooth metal": Principled(_GREY, 0.15, 0.95, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
 }
 
-# Number of cos(theta_i) per row of the table when fits are compared.
+# Number of cosines cos(theta_i) per row of the table at which fits are compared.
 _DIRECTIONS = 16
 
 
 class Constant(NamedTuple):
     """Result of `fit_constant`.
 
-    `principled`: the parameters as floats. `log_loss` (eq. 7) and `figures`: errors over the whole table. `adapter`:
-    the same parameters as an adapter whose network has no inputs. `brightness`: the light that they reflect, over all
-    directions, divided by the light that the material reflects.
+    `principled`: the parameters as floats. `log_loss` (eq. 7) and `figures`: errors over the whole table. `adapter`: an
+    adapter with the same parameters, whose network has no inputs. `brightness`: the light that the fitted BRDF
+    reflects, summed over all directions, divided by the light that the material reflects.
     """
 
     principled: Principled
@@ -85,7 +89,10 @@ class _Judged(NamedTuple):
     brightness: float
 
     def score(self, recipe: Recipe) -> float:
-        """The fit with the lowest score is chosen. The albedo has the same weight as in the fits' loss."""
+        """The log loss plus the weighted albedo error, as in the loss of the fits.
+
+        The fit with the lowest score is chosen.
+        """
         return self.log_loss + recipe.albedo * self.albedo_error**2
 
 
@@ -96,17 +103,19 @@ def fit_constant(
     *,
     progress: Callable[[loop.Run], None] = lambda run: None,
 ) -> Constant:
-    """Fits the isotropic table of one material from several starting points; returns the best by log loss and albedo.
+    """Fits the isotropic table of one material from several starting points, and returns the fit with the lowest score.
 
     `record` says where the table comes from and is stored with the adapter. Equal arguments give equal results on the
-    same machine. Raises `TableError` for a table of several materials or of other bins.
+    same machine. Raises `TableError` if the table has several materials or another grid.
     """
     if len(tables.values) != 1:
-        raise TableError(f"constant parameters describe one material, the table has {len(tables.values)}")
+        raise TableError(
+            f"constant parameters describe one material, but the table has {len(tables.values)} materials"
+        )
     if tables.values.shape[1:] != ISOTROPIC.shape:
         raise TableError(
-            f"constant parameters are fitted to isotropic tables {ISOTROPIC.shape}, "
-            f"this one has {tables.values.shape[1:]}"
+            f"constant parameters are fitted to isotropic tables of shape {ISOTROPIC.shape}, "
+            f"but this table has the shape {tables.values.shape[1:]}"
         )
     pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
     run = loop.start(recipe, _starts(tables))

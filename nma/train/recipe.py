@@ -17,28 +17,31 @@ from nma.table.quadrature import FINEST
 class Recipe:
     """Settings of a training run.
 
-    A step takes `rows` random rows (material, theta_i) and `bins_per_row` bins of each row. It runs the network once
-    per row, and averages the target over `points` points per bin.
+    A row is a bin of wi of one material. A training step takes `rows` random rows, and `bins_per_row` bins of wo in
+    each row. The step runs the network once per row, and averages the target over `points` points per bin.
 
     - `target`: "principled" has the paper's 11 parameters per instance. "stretched" adds one parameter, which stretches
-      the specular lobe along the plane of incidence. "measured" adds three more, which fade out the specular lobe and
-      flatten the diffuse lobe. "anisotropic" has the parameters of "measured", but stretches lobes along the axes of
-      the surface.
+      the specular lobe along the plane of incidence. "measured" adds three more parameters, which fade out the specular
+      lobe and flatten the diffuse lobe. "anisotropic" has the parameters of "measured", but stretches lobes along the
+      axes of the surface.
     - `grid`: the resolution of the tables.
-    - `bounded`: dim the target where it might reflect more light than it receives. Only for directional targets.
-    - `points_law`: how the points of a bin are drawn: "crowded", denser towards the mirror direction
-      (`nma.table.quadrature`); "uniform" over the bin (the paper); or "centre", one point in the middle of the bin
-      (point supervision).
+    - `bounded`: if true, the target is dimmed where it might reflect more light than it receives. Targets that are not
+      `directional` are never dimmed.
+    - `points_law`: how the points of a bin are drawn. "crowded" points are denser towards the mirror direction
+      (`nma.table.quadrature`). "uniform" points are uniform over the bin, as in the paper. "centre" is a single point
+      in the middle of the bin (point supervision).
     - `finest`: smallest microfacet width (alpha) that "crowded" points resolve.
-    - `bins_law`: how bins are chosen: "uniform" over the table, or "mirror", half uniform and half near the mirror
-      direction, with weights that undo the choice.
-    - `loss`: "log" is eq. 7. "huber" is eq. 7 for residuals beyond three standard errors of the table's bin and
-      quadratic for smaller residuals, so that noisy bins are fitted by their mean, not by their median.
-    - `energy`: weight of the linear error, which is added to the logarithmic error so that bright bins count by their
-      energy.
-    - `albedo`: weight of the squared error of the directional albedo, from twice `albedo_samples` samples per row.
-    - `schedule`: of the learning rate. "onecycle" peaks at `learning_rate`, "plateau" halves it when the loss stalls,
-      and "constant" keeps it.
+    - `bins_law`: how bins are chosen. "uniform" chooses bins uniformly. "mirror" chooses half of the bins uniformly and
+      half near the mirror direction, with weights that correct the bias of this choice.
+    - `loss`: "log" is eq. 7. "huber" is linear like eq. 7 for residuals beyond three standard errors of the table's
+      bin, and quadratic for smaller residuals. The quadratic part makes the fit of a noisy bin approach the bin's mean,
+      not its median.
+    - `energy`: weight of the error of the values themselves, which is added to the error of their logarithms. It makes
+      bright bins count more.
+    - `albedo`: weight of the squared error of the directional albedo, which is estimated from two times
+      `albedo_samples` samples per row.
+    - `schedule`: how the learning rate changes. "onecycle" rises to `learning_rate` and falls again. "plateau" starts
+      at `learning_rate` and halves the rate when the loss stalls. "constant" keeps `learning_rate`.
     - `average`: decay of the exponential moving average of the weights; 0 means no averaging.
     """
 
@@ -80,18 +83,23 @@ class Recipe:
                 raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
         if self.target in ("stretched", "measured") and not self.directional:
             raise NmaError(
-                "a target stretched along the plane of incidence depends on the direction; use principled"
+                "a target stretched along the plane of incidence depends on the direction, so it cannot have constant "
+                "parameters; use the target 'principled'"
             )
         if bool(self.grid.phi_i) != (self.target == "anisotropic"):
             raise NmaError(
-                "an anisotropic target needs anisotropic tables, and the other way round; set both, or neither"
+                "the target 'anisotropic' needs a grid with azimuths of wi, and such a grid needs this target; "
+                "set both, or neither"
             )
         if not 0 <= self.average < 1:
-            raise NmaError(f"average must lie in 0 .. 1 (excluded), got {self.average}")
+            raise NmaError(f"average must be at least 0 and below 1, got {self.average}")
 
     @property
     def bounds_energy(self) -> bool:
-        """Whether the target is dimmed. With constant parameters it is not, so that it stays reciprocal."""
+        """Whether the target is dimmed.
+
+        A target with constant parameters is not dimmed, so that it stays reciprocal.
+        """
         return self.bounded and self.directional
 
     @property
@@ -117,7 +125,7 @@ PAPER = Recipe(
     average=0.0,
 )
 
-# One material: a small network with the direction as its only input.
+# For one material: a small network with the direction as its only input.
 SINGLE = Recipe(
     network="3x32",
     encoding="direction",
@@ -132,11 +140,12 @@ SINGLE = Recipe(
     steps=6_000,
 )
 
-# One material with values free of noise: measured, tabulated, or a BSDF of another program.
+# For one material whose values have no noise: a measurement, a tabulated material, or a BSDF of another program.
 MEASURED = replace(
     SINGLE,
     target="measured",
-    # The bound does not include the fade, so it would dim bright lobes that fade out.
+    # The bound on the reflected light ignores the fade of lobes, so it would dim bright lobes that are faded out
+    # anyway.
     bounded=False,
     rows=512,
     bins_per_row=64,
@@ -150,7 +159,7 @@ MEASURED = replace(
     average=0.0,
     steps=16_000,
 )
-# The same for an anisotropic material.
+# The recipe `MEASURED` for an anisotropic material.
 ANISOTROPIC = replace(
     MEASURED, encoding="azimuth", target="anisotropic", grid=Grid(theta_i=20, theta_o=20, phi_o=40, phi_i=40)
 )
@@ -174,8 +183,8 @@ def preset(name: str, **changes) -> Recipe:
 def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
     """The preset `name` for a class, with `changes` as for `preset`.
 
-    Some encodings are named after a class. The preset's encoding is then replaced by the encoding of this class, or by
-    `raw` if this class has no encoding.
+    If the preset's encoding is named after a class, it is replaced by the encoding of the class `space`, or by `raw` if
+    this class has no encoding.
     """
     recipe = preset(name, **changes)
     if recipe.encoding not in sources.classes():

@@ -1,4 +1,4 @@
-"""Runs a training from data to an adapter, for a whole class or for one material."""
+"""Trains an adapter from tables, for a whole class or for one material."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from nma.train import loop
 from nma.train.batches import BinSampler, Pool, Stream, draw
 from nma.train.recipe import Recipe
 
-# The blend at which training starts: a coloured rough metal, and a sharp, colourless reflection.
+# The blend at which training starts: two grey, half metallic instances, of which the first is rough and the second
+# smooth.
 _INITIAL = Blend(
     (
         Principled(Color(0.5, 0.5, 0.5), 0.5, 0.5, 0.5, 0.1, 0.1, 0.1, 0.1, 0.5, 0.0, 0.1, 0.0, 0.12),
@@ -38,7 +39,7 @@ _INITIAL = Blend(
 
 
 def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
-    """Random layers, determined by the recipe's seed, whose outputs are close to a plausible blend."""
+    """Random layers, determined by the recipe's seed, whose outputs are close to the blend `_INITIAL`."""
     instances = tuple(_INITIAL.instances[k % 2] for k in range(recipe.instances))
     blend = Blend(instances, (1.0 / recipe.instances,) * recipe.instances)
     params = target.TARGETS[recipe.target]
@@ -61,9 +62,9 @@ def train_class(
 ) -> tuple[Adapter, loop.Run]:
     """Trains an adapter on tables of many materials. Returns the adapter and the run.
 
-    `record` says where the tables come from and is stored with the weights. If `data` is settings instead of tables,
-    materials are simulated during training: `data.materials` of them are in memory, and every `refresh` steps new
-    materials replace a block of them. Raises `TableError` if the data is of another class than `space`.
+    `record` says where the tables come from and is stored with the weights. If `data` is `Settings` instead of tables,
+    materials are simulated during training. Then `data.materials` materials are in memory, and every `refresh` steps a
+    block of new materials replaces the oldest block. Raises `TableError` if the data is of another class than `space`.
     """
     check_class(data.class_name, space.name, "the adapter")
     sampler = BinSampler(recipe.bins_law, recipe.grid)
@@ -126,7 +127,7 @@ def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[st
 
 
 def record_of(recipe: Recipe, run: loop.Run) -> dict[str, Any]:
-    """The part of the training record that every run has."""
+    """The entries of the training record that all runs have."""
     return {
         "recipe": asdict(recipe),
         "steps": run.step,
