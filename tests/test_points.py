@@ -151,7 +151,9 @@ def test_recipes_and_sources_must_agree_on_isotropy():
         fit(from_dict(BRUSHED), QUICK, {})
     with pytest.raises(NmaError, match="the table is isotropic; take a recipe whose target"):
         fit(tabulate_values(LAMBERT, grid=SMALL), recipes.ANISOTROPIC)
-    with pytest.raises(NmaError, match="formula has values without noise; they need the loss 'log'"):
+    with pytest.raises(
+        NmaError, match="formula has values without noise, so the recipe's loss must be 'log'"
+    ):
         fit(LAMBERT, replace(QUICK, loss="huber"))
     with pytest.raises(NmaError, match="an anisotropic target needs anisotropic tables"):
         replace(recipes.MEASURED, target="anisotropic")

@@ -103,12 +103,12 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
     for change in ({"seed": 1}, {"learning_rate": 0.02}, {"loss": "log", "steps": 300}):
         with pytest.raises(NmaError, match=rf"run.ckpt.*other settings \({', '.join(change)}\)"):
             loop.resume(replace(TINY, **change), layers, path)
-    with pytest.raises(NmaError, match="other data.*delete it"):
+    with pytest.raises(NmaError, match="other data.*delete the file"):
         loop.resume(TINY, layers, path, {"data": "another dataset"})
     whole = path.read_bytes()
     for content in (whole[: len(whole) // 2], b"", b"no archive"):
         path.write_bytes(content)
-        with pytest.raises(NmaError, match="damaged checkpoint.*delete it") as caught:
+        with pytest.raises(NmaError, match="damaged checkpoint.*delete the file") as caught:
             loop.resume(TINY, layers, path)
         assert "\n" not in str(caught.value)
 
@@ -197,7 +197,7 @@ def test_the_plateau_schedule_halves_a_stalled_step():
     [
         ({"rows": 0}, "rows must be positive"),
         ({"learning_rate": -1.0}, "learning_rate must be positive"),
-        ({"average": 1.0}, "average must lie in 0 .. 1"),
+        ({"average": 1.0}, "average must be at least 0 and below 1"),
         ({"loss": "l2"}, "loss is one of huber, log; got 'l2'"),
         ({"points_law": "random"}, "points_law is one of crowded, uniform, centre"),
         ({"target": "stretched", "directional": False}, "stretched .* depends on the direction"),

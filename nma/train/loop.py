@@ -182,7 +182,7 @@ def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] |
             leaves = [f[f"leaf{k}"] for k in range(len(jax.tree.leaves(run.state)))]
             losses, log_losses = f["losses"].tolist(), f["log_losses"].tolist()
     except Exception as e:
-        raise NmaError(f"{path}: damaged checkpoint ({e}); delete it to start again") from None
+        raise NmaError(f"{path}: damaged checkpoint ({e}); delete the file to start again") from None
     if notes["recipe"] != asdict(recipe):
         changed = [k for k, v in asdict(recipe).items() if notes["recipe"].get(k) != v]
         raise NmaError(
