@@ -1,5 +1,6 @@
 """The options of all commands declare bounds or choices, and refuse all other values."""
 
+from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
@@ -90,6 +91,20 @@ def test_an_output_must_have_the_ending_of_its_format(nma, tmp_path, monkeypatch
         assert (code, out) == (2, "")
         assert f"{name} must end in {ending}" in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_longest_ending_of_a_name_counts():
+    """A second renderer can have an ending of its own for JSON files, which do not go to the first renderer then."""
+    endings = (".xml", ".json", ".blend.json")
+    for name, found in (
+        ("a.json", ".json"),
+        ("a.v2.json", ".json"),
+        ("a.blend.json", ".blend.json"),
+        (".json", None),
+        ("json", None),
+        ("a.JSON", None),
+    ):
+        assert options.ending(Path("folder.xml", name), endings) == found
 
 
 def test_a_network_is_refused_before_a_material_is_simulated(nma, tmp_path, monkeypatch):

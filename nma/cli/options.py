@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,11 +51,17 @@ def choice(help: str, *values: str) -> Any:
     return typer.Option(help=f"{', '.join(values)}. {help}", callback=check)
 
 
+def ending(path: Path, endings: Iterable[str]) -> str | None:
+    """The ending of a file's name out of `endings`, or None. If `.json` and `.blend.json` fit, it is the longer one."""
+    fitting = [text for text in endings if path.name.endswith(text) and path.name != text]
+    return max(fitting, key=len, default=None)
+
+
 def output(help: str, *endings: str, **more: Any) -> Any:
     """The option --output: a file to write, whose name must end in one of `endings`."""
 
     def check(path: Path | None) -> Path | None:
-        if path is not None and path.suffix not in endings:
+        if path is not None and ending(path, endings) is None:
             raise typer.BadParameter(f"{path} must end in {either(endings)}")
         return path
 

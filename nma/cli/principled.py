@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 
 # If the mean error of the directional albedo is above this limit, it is visible in pictures, so a warning is printed.
 ALBEDO_LIMIT = 0.05
+
+
+class Text(NamedTuple):
+    """A kind of text file: the renderer that reads it, and the function that returns its content."""
+
+    renderer: str
+    of: Callable[[Principled], str]
 
 
 def _xml(fitted: Principled) -> str:
@@ -31,9 +38,10 @@ def _json(fitted: Principled) -> str:
     return principled_json(fitted)
 
 
-# For each ending of an output file's name, the function that returns the content of the file. These functions contain
-# their own imports, so that `nma --help` is quick.
-_TEXTS: dict[str, Callable[[Principled], str]] = {".xml": _xml, ".json": _json}
+# The kinds of text files, by the ending of a file's name. If two endings fit, the longer one counts: a renderer whose
+# files are JSON, too, takes an ending such as `.blend.json`. The functions contain their own imports, so that `nma
+# --help` is quick.
+_TEXTS = {".xml": Text("Mitsuba", _xml), ".json": Text("Mitsuba", _json)}
 
 
 def register(app: typer.Typer) -> None:
@@ -93,11 +101,13 @@ def principled(
         console.say(_warning(error, fit.brightness))
     if output is None:
         return
-    if output.suffix == ".safetensors":
+    kind = options.ending(output, _TEXTS)
+    if kind is None:
         fit.adapter.save(output)
+        console.say(f"wrote {output}")
     else:
-        files.write_text(output, _TEXTS[output.suffix](fit.principled))
-    console.say(f"wrote {output}")
+        files.write_text(output, _TEXTS[kind].of(fit.principled))
+        console.say(f"wrote {output} for {_TEXTS[kind].renderer}")
 
 
 def _warning(error: float, brightness: float) -> str:
