@@ -24,7 +24,7 @@ from nma.target.decode import TARGETS, decode, output_size
 
 ROOT = Path(__file__).parent.parent
 CASES = 4000
-# The class with which the tests try an encoding that does not have the name of a class.
+# For each encoding that is not named like a class, the class whose parameters the tests encode.
 CLASS_OF = {"direction": MEASURED, "azimuth": MEASURED, "raw": LIBRARY}
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -44,11 +44,11 @@ def saved(folder, space, name, instances, directional, params, matrix, bias):
 
 
 def class_of(name):
-    """The class with which an encoding is tried."""
+    """Returns the class whose parameters the tests encode with the encoding `name`."""
     if name in CLASS_OF:
         return CLASS_OF[name]
     assert name in sources.classes(), (
-        f"encoding '{name}': add the class with which it is tried to CLASS_OF in tests/test_runtime_twins.py"
+        f"encoding '{name}': add the class that tests this encoding to CLASS_OF in tests/test_runtime_twins.py"
     )
     return sources.space(name)
 

@@ -88,7 +88,7 @@ def test_simulate_takes_the_class_of_the_material(bare, nma):
 
 
 def test_files_of_tables_name_the_class(bare, nma):
-    """A command refuses tables of another class, and says what to do."""
+    """A command refuses tables of a class that it does not expect, and the error message says what to do."""
     assert nma("simulate", "--class", "bare", "--draw", 1, "--walks", 1600, "-o", "drawn.npz")[0] == 0
     with np.load("drawn.npz") as arrays:
         assert str(arrays["class"]) == "bare"
