@@ -42,10 +42,10 @@ def test_passes_average_to_one_picture_and_equal_seeds_repeat_it(monkeypatch):
 
 def test_errors_of_mitsuba_during_rendering_become_one_line(monkeypatch):
     def fails(*args, **kwargs):
-        raise RuntimeError("[integrator.cpp:12] this scene\nis beyond me")
+        raise RuntimeError("[integrator.cpp:12] the film\nhas no pixels")
 
     monkeypatch.setattr(mi, "render", fails)
-    with pytest.raises(SceneError, match="cannot render the scene: this scene is beyond me"):
+    with pytest.raises(SceneError, match="cannot render the scene: the film has no pixels"):
         render_passes(load_dict(EMPTY | {"integrator": {"type": "path"}}), 1)
 
 
