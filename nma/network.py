@@ -65,8 +65,8 @@ def forward_lanes(
 
     The network is unrolled into the kernel, with its weights as literals. In the virtual functions of a renderer,
     weights in memory, as in `drjit.nn`, would take ten times as long on LLVM, because they are gathered lane by lane. A
-    packet without any `active` lane skips the network and returns zeros. The skip saves time, because a renderer calls
-    the BSDF of a scene with only one BSDF even for rays that hit nothing.
+    packet without any `active` lane skips the network and returns zeros. The skip saves time, because in a scene with
+    only one BSDF, a renderer calls this BSDF even for rays that hit nothing.
     """
     import drjit as dr
 

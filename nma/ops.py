@@ -1,7 +1,7 @@
 """Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written only once (CONVENTIONS.md).
 
 A function chooses the array package by the types of its arguments. For plain Python numbers, the result is a plain
-Python number. Code that uses this module must not branch on values; it calls `select` instead. A `Vec3` is a triple of
+Python number. Code that uses this module must call `select` instead of branching on values. A `Vec3` is a triple of
 arrays: a direction or an RGB colour.
 """
 

@@ -33,7 +33,8 @@ _ADVICE = {
 
 
 class Bounds(NamedTuple):
-    """The range from `low` to `high`. Every check of a parameter calls `bad`, and reports the message of `refusal`.
+    """The range from `low` to `high`. Every check of a parameter calls `bad`, and reports the message that `refusal`
+    returns.
 
     Methods take NumPy or Dr.Jit arrays. `low` and `high` may also be arrays, with one number per column.
     """
@@ -208,9 +209,9 @@ class ParamSpace:
         return out
 
 
-# The largest refractive index and the largest optical depth that sources accept. With a larger index, Fresnel terms
-# overflow in single precision. In a white medium, the number of steps of a random walk grows with about the square of
-# the depth, so at larger depths the program would seem to hang.
+# The largest refractive index and the largest optical depth that sources accept. Larger indices would make Fresnel
+# terms overflow in single precision. In a white medium, the number of steps of a random walk grows with about the
+# square of the depth, so at larger depths the program would seem to hang.
 _MAX_INDEX, _MAX_DEPTH = 1e4, 1e3
 
 LAYERED3 = ParamSpace(

@@ -36,7 +36,7 @@ def use(variant: str = "auto") -> str:
             scalar_rgb is first chosen.
 
     Raises:
-        ParamError: Mitsuba has no such variant.
+        ParamError: Mitsuba has no variant of this name.
         MissingDependencyError: the variant needs an NVIDIA GPU, a C++ compiler or libLLVM that this machine does not
             have, or libLLVM is too old.
     """

@@ -220,9 +220,8 @@ def _parts(bsdf: Any) -> list[Any]:
         def put_object(self, name, value, flags):
             if isinstance(value, mi.BSDF):
                 found.append(value)
-                value.traverse(
-                    Parts()
-                )  # nanobind does not call a method of an object from within that method
+                # A new object, because nanobind does not call a method of an object from within the same method.
+                value.traverse(Parts())
 
     bsdf.traverse(Parts())
     return found

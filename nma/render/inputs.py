@@ -223,7 +223,7 @@ def _indices(values: list[Any]) -> list[int]:
 
 
 def _value(param: Param, given: Any) -> Any:
-    """Converts an input to the type that `Inputs.values` has for it."""
+    """Converts an input to a `mi.Float`, a `mi.Color3f` or a `mi.Texture`."""
     import drjit as dr
     import mitsuba as mi
 

@@ -6,7 +6,7 @@ density. Multiple importance sampling stays unbiased, because the reported densi
 and `pdf` and `sample` report the same density.
 
 `sample` simulates one random walk. BSDFs that blend others (`blendbsdf`, `mask`) assume that weight times pdf is the
-value of f, which is wrong for a walk. Inside such a BSDF, `sample` draws a direction from `pdf`, and its weight is an
+value of f, which is wrong for a walk. Inside a blend, `sample` draws a direction from `pdf`, and its weight is an
 estimate of the value divided by `pdf`. Drawing from `pdf` is unbiased in every BSDF, but slower than a walk, and has 1
 to 1.4 times the variance of a walk.
 

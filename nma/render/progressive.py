@@ -34,7 +34,7 @@ def render_passes(
 
     Args:
         scene: what `mi.load_dict` or `mi.load_file` returned.
-        spp: samples per pixel in total; the last pass may be smaller than the others.
+        spp: samples per pixel in total. The last pass may have fewer samples than the others.
         integrator: an integrator to use in place of the scene's integrator.
         progress: called after each pass with the samples per pixel of that pass.
 

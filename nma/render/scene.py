@@ -82,8 +82,7 @@ def preview_scene(
         mesh_up: the axis of the mesh file that points up, "z" or "y".
         integrator: "path", "prb", the name of another Mitsuba integrator that takes `max_depth`, or the dictionary of
             an integrator.
-        hide_sun: whether to leave out the disc of the sun, but not the sky and the lamp. This option is for "outdoors"
-            only.
+        hide_sun: whether the lighting "outdoors" leaves out the disc of the sun, but keeps the sky and the lamp.
         rfilter: reconstruction filter of the film. "box" keeps pixels statistically independent.
         sampler: name of a Mitsuba sampler. "multijitter" leaves less noise, but takes only certain sample counts; see
             `nma.render.progressive.sampler`.
@@ -182,7 +181,7 @@ def _sensor(camera: Camera, size: tuple[int, int], spp: int, rfilter: str, sampl
 
 
 def _floor(far: float, near: float, contrast: float) -> dict[str, Any]:
-    """A large sheet of graph paper. Its pattern fades out with distance, so that the far edge is plain grey against the
+    """A large sheet of graph paper. The pattern fades out with distance, so that the far edge is plain grey against the
     sky."""
     import mitsuba as mi
 

@@ -1,7 +1,7 @@
 """Makes Mitsuba textures from arrays, and makes procedural arrays: worn metal, patches of lacquer, marbled pigment.
 
 The values are linear parameters of a material, not colours on a screen, so `bitmap_texture` loads them as raw data. The
-procedural textures tile, and a seed determines them.
+procedural textures tile without seams. The seed determines all values.
 """
 
 from __future__ import annotations
