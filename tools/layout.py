@@ -1,8 +1,8 @@
 """Computes the layout of a drawing of boxes on floors, so that the arrows are straight and have few crossings.
 
-The method is that of Sugiyama, Tagawa and Toda 1981. A *place* is a box, or the point where an arrow passes a floor.
-First, the places of each floor are sorted by the mean positions of the places that they are linked to. Then each place
-is moved as close to this mean position as the order of the places allows.
+The layout method is that of Sugiyama, Tagawa and Toda 1981. A *place* is a box, or the point where an arrow passes a
+floor. First, the places of each floor are sorted by the mean positions of the places that they are linked to. Then each
+place is moved as close to the mean position of its linked places as the order of the places allows.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 Arrow = tuple[str, str]
-Place = str | tuple[str, str, int]  # a box, or a floor that an arrow passes: (upper box, lower box, floor)
+# The name of a box, or (upper box, lower box, floor) for an arrow that passes the floor.
+Place = str | tuple[str, str, int]
 
 TRIES, SWEEPS = 60, 16
-# A link is the part of an arrow between two neighbouring floors. The weight with which the layout shortens a link is
-# multiplied by STRAIGHT for each end of the link that is not a box, so that long arrows are straight where they pass
-# floors.
+# A link is the part of an arrow between two neighbouring floors. The layout minimises the weighted sum of the squared
+# horizontal lengths of all links. The weight of a link is multiplied by STRAIGHT for each of its ends that is not a
+# box, so that long arrows are straight where they pass floors.
 STRAIGHT = 6.0
 
 
@@ -30,7 +31,7 @@ class Layout(NamedTuple):
 
 
 def layout(floors: Sequence[Sequence[str]], arrows: Sequence[Arrow], box: float, passage: float) -> Layout:
-    """Computes the layout.
+    """Computes the positions of the boxes and arrows of a drawing.
 
     Args:
         floors: the boxes of each floor; the highest floor comes first.
@@ -75,8 +76,8 @@ def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> l
 def _sort(rows: list[list[Place]], links: Sequence[tuple[Place, Place]], down: bool) -> None:
     """Sorts the places of every floor in turn by the mean positions of the places that they are linked to.
 
-    With `down`, the links to the floor above count, and the highest floor comes first. Without `down`, the links to the
-    floor below count, and the lowest floor comes first.
+    With `down`, the floors are sorted from top to bottom, each by its links to the floor above. Without `down`, the
+    floors are sorted from bottom to top, each by its links to the floor below.
     """
     for n in range(1, len(rows)) if down else range(len(rows) - 2, -1, -1):
         before = {place: k for k, place in enumerate(rows[n - 1 if down else n + 1])}

@@ -3,8 +3,8 @@
     python tools/make_conductors.py [OUT.csv]
 
 Mitsuba's plugin `conductor` projects the spectra in its folder `data/ior` to linear sRGB, and this script reads the
-projected values. It omits transparent crystals, whose absorption k is near 0. It also omits spectra whose projection
-has a negative channel, which Mitsuba clamps to 0.
+projected values. The script omits transparent crystals, whose absorption k is near 0, and spectra whose projection has
+a negative channel, which Mitsuba clamps to 0.
 """
 
 import argparse
@@ -18,15 +18,15 @@ from nma.files import write_text
 OUT = Path(__file__).parents[1] / "nma" / "conductors" / "conductors.csv"
 HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
 
-# A material whose k is below this limit in any channel is a tinted dielectric, and is omitted. The smallest k of all
-# other materials is .114.
+# A material whose k is below this limit in any channel is a tinted dielectric, and is omitted. The smallest k of the
+# remaining materials is .114.
 MIN_K = 0.1
 
-# These substances are not used for training, so that they can test adapters on unseen metals. They are an alkali metal,
-# a refractory metal, a bright metal, a liquid metal, a nitride that looks like gold, a metal whose eta rises towards
-# blue, a weakly absorbing oxide, and amorphous carbon. Mitsuba has several data files for some substances (`Hg`,
-# `Hg_palik`). None of the files of a test substance is used for training; otherwise the test would contain training
-# data.
+# The substances in HELD_OUT are not used for training, so that they can test adapters on unseen metals. The list has an
+# alkali metal, a refractory metal, a bright metal, a liquid metal, a nitride that looks like gold, a metal whose eta
+# rises towards blue, a weakly absorbing oxide, and amorphous carbon. Mitsuba has several data files for some substances
+# (`Hg`, `Hg_palik`). None of the files of a test substance is used for training; otherwise the test would contain
+# training data.
 HELD_OUT = ("Na", "W", "Rh", "Hg", "TiN", "Ta", "Cu2O", "a-C")
 
 
@@ -49,7 +49,7 @@ def main() -> None:
     out = parser.parse_args().out
 
     mi.set_variant("scalar_rgb")
-    mi.set_log_level(mi.LogLevel.Error)  # otherwise Mitsuba prints a warning for every colour that it clamps
+    mi.set_log_level(mi.LogLevel.Error)  # no warnings about clamped colours
     files = (Path(mi.__file__).parent / "data" / "ior").glob("*.eta.spd")
     names = sorted((f.name.removesuffix(".eta.spd") for f in files), key=lambda name: (name.lower(), name))
 

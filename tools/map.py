@@ -4,7 +4,7 @@
 
 A room is a module or a package directly in `nma/`. The floors of the rooms are read from the contract in
 pyproject.toml, and the imports are read from the code. A thin arrow from room A to room B means that A imports B. The
-arrow is omitted if A also imports B indirectly, through other rooms.
+arrow from A to B is omitted if A also imports B indirectly, through other rooms.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Plan(NamedTuple):
 
     floors: list[list[str]]
     imports: frozenset[Arrow]
-    steps: dict[Arrow, Step]  # each key is the pair of the upper and the lower room of a step
+    steps: dict[Arrow, Step]  # the key is (upper room, lower room) of the step
     layout: Layout
     ports: dict[tuple[Arrow, str], float]  # x of an arrow's end at a box, relative to the centre of the box
     left: float

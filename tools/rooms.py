@@ -1,8 +1,8 @@
 """Reads the rooms of the package, their floors and the imports between them.
 
 A room is a module or a package directly in `nma/`. The floor of each room is read from pyproject.toml, where the
-contract that `make lint` checks lists the floors. The imports of each room are read from the code. They include imports
-inside functions and imports that only type checkers execute.
+contract that `make lint` checks lists the floors. The imports of each room are read from the code. Imports inside
+functions count, and imports that only type checkers execute count, too.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def _room(module: str) -> str:
 
 
 def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
-    """Removes every arrow from A to B for which a path of other arrows leads from A to B. There must be no cycles."""
+    """Removes every arrow from A to B for which other arrows form a path from A to B. There must be no cycles."""
 
     @cache
     def below(room: str) -> frozenset[str]:
@@ -64,7 +64,7 @@ def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
 
 
 def circle(arrows: frozenset[Arrow]) -> list[str]:
-    """The rooms in cycles of imports, and the rooms that import these directly or indirectly. Empty without a cycle."""
+    """The rooms in cycles of imports, and the rooms that import such a room directly or indirectly."""
     left = set(arrows)
     while True:
         importing = {a for a, _ in left}
@@ -77,7 +77,8 @@ def circle(arrows: frozenset[Arrow]) -> list[str]:
 def summary(room: str, fits: Callable[[str], bool] = lambda text: True) -> str:
     """A short description of a room: the longest beginning of its docstring's first sentence for which `fits` is true.
 
-    The beginning ends before a colon, a semicolon or a parenthesis. If no such beginning fits, it ends before a comma.
+    The description ends before a colon, a semicolon or a parenthesis. If no such beginning fits, the description ends
+    before a comma.
     """
     place = ROOT / PACKAGE / room
     file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")

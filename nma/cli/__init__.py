@@ -20,7 +20,7 @@ from nma.errors import NmaError, one_line
 
 
 class _Commands(TyperGroup):
-    """The group of all commands. On Ctrl-C it prints a message, which typer does not."""
+    """The group of all commands, which prints a message on Ctrl-C; typer alone prints none."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -43,8 +43,8 @@ app = typer.Typer(
     "measured materials. [bold]library[/bold] adds materials to a library and takes some out. [bold]principled[/bold] "
     "fits one plain Principled BRDF. [bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
 )
-# The files of this folder that define commands. `nma --help` lists single commands first and then groups of commands,
-# each in this order.
+# The files of this folder that define commands, in the order of `nma --help`, which lists single commands before groups
+# of commands.
 COMMANDS = (
     "materials",
     "simulate",
@@ -123,8 +123,8 @@ def _interrupted() -> NoReturn:
 def _close_stdout() -> None:
     """Redirects stdout to the null device if writing to stdout fails.
 
-    Writing fails if the reader of a pipe has ended or the disk is full. At its exit, Python flushes stdout and would
-    print another error.
+    Writing fails if the reader of a pipe has ended or the disk is full. Without the redirection, Python would print
+    another error when it flushes stdout at its exit.
     """
     try:
         sys.stdout.flush()

@@ -51,8 +51,8 @@ def compare(
     """Compare an image with a reference image, or compare two renderings of a material.
 
     For a material, the command compares a picture rendered by its adapter with a picture rendered by the reference
-    simulation. The reference is rendered twice, with different seeds. The column `noise` compares the two pictures of
-    the reference, which differ only by their noise. The figures are defined in docs/evaluation.md.
+    simulation. The command renders the reference twice, with different seeds. The column `noise` compares the two
+    pictures of the reference, which differ only by their noise. The figures are defined in docs/evaluation.md.
 
     Examples: [bold]nma compare test.exr reference.exr -o difference.png[/bold],
     [bold]nma compare gold-red-lacquer --spp 512[/bold]

@@ -21,15 +21,16 @@ __all__ = ["TrainingBar", "counting", "err", "loss_plot", "number", "out", "prog
 out = Console()
 
 _GAP = 2
-# A cell with more characters than this is a sentence, whose line may be broken between words.
+# Cells with more characters than this limit are sentences, which may be wrapped between words.
 _SENTENCE = 24
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None) -> Group:
-    """Returns a table that fits the width of the terminal. Sentences are broken between words; numbers are not broken.
+    """Returns a table that fits the width of the terminal. Sentences are wrapped between words; numbers are never
+    wrapped.
 
-    Columns that do not fit go into more tables below the first, and each of these tables repeats the first column.
-    Brackets in a cell are printed as text and not interpreted as markup.
+    Columns that do not fit are printed in further tables below the first table. Each further table repeats the first
+    column. Brackets in a cell are printed as text and not interpreted as markup.
     """
     cells = [[number(cell) if isinstance(cell, float) else str(cell) for cell in row] for row in rows]
     columns = [
@@ -55,8 +56,9 @@ def counting(
 ) -> Iterator[Callable[..., Any]]:
     """Shows a progress bar that counts from `before` to `total`, with a rate in `unit`.
 
-    Yields a function that updates the bar. Its arguments are the count so far and the work done since the start, and
-    optionally a new `note` or `description` of the bar. It returns the rate, which is the work per second.
+    Yields a function that updates the bar. The arguments of this function are the count so far and the work done since
+    the start, and optionally a new `note` or `description` of the bar. The function returns the rate, which is the work
+    per second.
     """
     with progress(unit) as bar:
         task = bar.add_task(title, total=total, completed=before, rate="", note="")
@@ -71,7 +73,7 @@ def counting(
 
 
 def number(value: float) -> str:
-    """Formats a number with four significant digits (.01382), or with two if it is smaller than 1e-4 (6.5e-06)."""
+    """Formats a number with four significant digits (.01382), or with two below 1e-4 (6.5e-06)."""
     text = f"{value:.4g}" if abs(value) >= 1e-4 or value == 0 else f"{value:.1e}"
     return text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text
 
@@ -82,7 +84,7 @@ def loss_plot(output: Path) -> Path:
 
 
 class _Column:
-    """A column of a table, and `width`, the smallest number of characters in which the column fits."""
+    """A column of a table. `width` is the smallest number of characters in which the column fits."""
 
     def __init__(self, heading: str, cells: Sequence[str], first: bool):
         widest = max(map(cell_len, cells), default=0)
@@ -96,7 +98,7 @@ class _Column:
 
 
 def _parts(columns: Sequence[_Column]) -> list[list[_Column]]:
-    """Divides all columns except the first among as few tables as possible, so that each table fits the terminal."""
+    """Divides all columns except the first among as few tables as possible that fit the width of the terminal."""
     parts: list[list[_Column]] = [[]]
     room = out.width - columns[0].width
     for column in columns[1:]:

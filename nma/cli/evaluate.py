@@ -22,10 +22,10 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print nothing but JSON on stdout.")] = False,
     clamp: options.Clamp = False,
 ) -> None:
-    """Compare an adapter with reference tables, bin by bin: prints the errors of each material, and their means.
+    """Compare an adapter with reference tables, bin by bin, and print the errors of each material and their means.
 
-    The averages of the adapter over the bins are integrated numerically. The line below the printed table gives the
-    error of this integration. docs/evaluation.md defines the printed errors.
+    The averages of the adapter over the bins are computed by numerical integration. The line below the printed table
+    gives the error of this integration. The page docs/evaluation.md defines the printed errors.
     """
     from nma.adapter import Adapter
     from nma.evaluate import evaluate as run
@@ -57,5 +57,8 @@ def evaluate(
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
-    """The figures for JSON. JSON cannot express infinity, so the infinite PSNR of equal tables becomes null."""
+    """The error figures with infinite values replaced by None, because JSON cannot express infinity.
+
+    The PSNR of equal tables is infinite.
+    """
     return {name: value if math.isfinite(value) else None for name, value in figures.items()}

@@ -1,4 +1,4 @@
-"""The commands `nma train-library` and `nma library`: libraries, in which many materials share one network."""
+"""The commands `nma train-library` and `nma library` for libraries, that is, networks that many materials share."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def encode(
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the batches.")] = 0,
 ) -> None:
-    """Find the code of a new material, and write a library that also contains it. The network does not change.
+    """Find the code of a new material, and write a library that also contains this code. The network stays the same.
 
     Example: [bold]nma library encode library.safetensors paper_white_rgb.bsdf -o more.safetensors[/bold]
     """

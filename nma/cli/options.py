@@ -1,4 +1,4 @@
-"""Options that several commands share. The option of every number declares its smallest and its largest value."""
+"""Options that several commands share. Every numeric option declares its smallest and its largest value."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ def _network(name: str | None) -> str | None:
     return name
 
 
-# The allowed words of options, which must be those that `nma.train.recipe.Recipe` and `nma.params` declare.
+# The allowed values of options. A test checks that `nma.train.recipe.Recipe` and `nma.params` declare the same values.
 TARGETS = ("principled", "stretched", "measured", "anisotropic")
 POINTS_LAWS = ("crowded", "uniform", "centre")
 LOSSES = ("huber", "log")
 POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
-# The paper's variants of the target. Each has the number of Principled BRDFs in the blend, and whether their parameters
-# depend on the view direction.
+# The paper's variants of the target, as pairs: the number of Principled BRDFs in the blend, and whether the parameters
+# of these BRDFs depend on the view direction.
 VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
 
 # Options of commands that train.

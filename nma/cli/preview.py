@@ -17,7 +17,7 @@ from nma.errors import ParamError
 if TYPE_CHECKING:
     from nma.materials import Material
 
-# The names of the command-line parameters that set what the preview scene shows, and with which light and camera.
+# The names of the command-line parameters that set how the preview scene is rendered.
 OPTIONS = ("adapter", "clamp", "changes", "camera", "lighting", "envmap", "mesh", "mesh_up", "depth")
 
 
@@ -77,7 +77,7 @@ def subject(
 
 
 def render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) -> Any:
-    """Renders a scene, shows a progress bar meanwhile, and returns the image."""
+    """Renders a scene while a progress bar is shown, and returns the image."""
     from nma.render.progressive import render_passes
 
     with samples_bar(title, spp) as advance:
@@ -88,8 +88,8 @@ def render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) 
 def samples_bar(title: str, total: int) -> Iterator[Callable[[str, int], None]]:
     """Shows a progress bar that counts samples per pixel.
 
-    Yields a function that updates the bar. Its arguments are a description of the current step, and the number of
-    samples per pixel that were rendered since the last call.
+    Yields a function that updates the bar. The arguments of this function are a description of the current step, and
+    the number of samples per pixel that were rendered since the last call.
     """
     done = 0
     with console.counting(title, total, "spp/s") as show:
@@ -118,7 +118,7 @@ def pixels(text: str) -> tuple[int, int]:
 
 
 def refuse(context: typer.Context, names: tuple[str, ...], subject: str) -> None:
-    """Rejects those of the options `names` that the user gave, because they have no effect for `subject`."""
+    """Raises `BadParameter` if the user gave any of the options `names`, which have no effect for `subject`."""
     given = [name for name in names if _given(context, name)]
     if given:
         flags = ", ".join("--set" if name == "changes" else f"--{name.replace('_', '-')}" for name in given)

@@ -15,7 +15,8 @@ from nma.cli import console, options, reading
 if TYPE_CHECKING:
     from nma.target import Principled
 
-# If the mean error of the directional albedo is above this limit, it is visible in pictures, so a warning is printed.
+# If the mean error of the directional albedo exceeds this limit, the error is visible in pictures, so the command
+# prints a warning.
 ALBEDO_LIMIT = 0.05
 
 
@@ -38,9 +39,9 @@ def _json(fitted: Principled) -> str:
     return principled_json(fitted)
 
 
-# The kinds of text files, by the ending of a file's name. If two endings fit, the longer one counts: a renderer whose
-# files are JSON, too, takes an ending such as `.blend.json`. The functions contain their own imports, so that `nma
-# --help` is quick.
+# The text formats, by the ending of a file's name. If two endings fit a name, the longer ending is used. A renderer whose
+# files are also JSON therefore needs a longer ending, such as `.blend.json`. The functions of the formats import their
+# modules only when they are called, so that `nma --help` is quick.
 _TEXTS = {".xml": Text("Mitsuba", _xml), ".json": Text("Mitsuba", _json)}
 
 
@@ -74,10 +75,10 @@ def principled(
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the walks and of the batches.")] = 0,
 ) -> None:
-    """Fit one Principled BRDF with constant parameters to a material, and print them as a dictionary for Mitsuba.
+    """Fit one Principled BRDF with constant parameters to a material, and print its parameters for Mitsuba.
 
     The fit uses no network and no blend, and the parameters do not depend on the direction, so that any renderer with a
-    Principled BRDF can use them.
+    Principled BRDF can use the fitted parameters.
 
     Examples: [bold]nma principled gold-red-lacquer -o gold.xml[/bold],
     [bold]nma principled paper_white_rgb.bsdf[/bold]

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 def material_of(name: str, changes: list[str] | None) -> Material:
     """Loads a named material, a material file, or the material of an adapter for a single material.
 
-    `changes` are the values of the option --set. They change a named material or a material file, and are ignored for
-    an adapter. Raises `NmaError` if a file cannot be read.
+    `changes` are the values of the option --set. The changes apply to a named material or a material file, and are
+    ignored for an adapter. Raises `NmaError` if a file cannot be read.
     """
     from nma import materials
     from nma.adapter import Adapter
@@ -50,7 +50,7 @@ def known_of(
 
     A named material or a material file (.toml) is simulated with `walks` random walks, which gives a table. A reference
     file (.npz) contains a table. Any other file that `nma.sources.read` can read gives BRDF values. If a file has
-    several materials, `material` selects one: by the name of an NBRDF network, or by the index of a table.
+    several materials, `material` selects one material by the name of an NBRDF network or by the index of a table.
 
     The record has the entries `data` (the kind and the name of the source), `material` (the name of the material) and,
     for tables, `walks_per_material`. Raises `NmaError` if a file cannot be read.
@@ -92,7 +92,8 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
     material or a material file (.toml). The BRDF of a named material or a material file is computed by the adapter
     `adapter`. `clamp` moves the material's parameters into the training range of this adapter.
 
-    Raises `NmaError` if a file cannot be read, and if it is a reference file, because a table has only means over bins.
+    Raises `NmaError` if a file cannot be read, and if `source` is a reference file, because a table has only means over
+    bins.
     """
     from nma import materials
     from nma.adapter import Adapter
@@ -181,16 +182,16 @@ def _number(path: Path, count: int, material: str | None) -> int:
 
 
 def _holds_tables(path: Path) -> bool:
-    """Whether an .npz file is a reference file. A file of NBRDF networks is not; it has an array `weights`."""
+    """Whether an .npz file is a reference file: only files of NBRDF networks have an array `weights`."""
     try:
         with arrays(path) as f:
             return "weights" not in f
-    except Exception:  # a damaged file, whose fault the function that reads it reports
+    except Exception:  # the function that reads the file then reports the fault
         return True
 
 
 def change_of(text: str) -> tuple[str, Any]:
-    """Parses a change such as `alpha_top=.2` and returns the name and the value, in the form of a material file."""
+    """Parses a change such as `alpha_top=.2` and returns the name and the value, as a material file gives them."""
     name, value = assignment(text)
     try:
         numbers = [float(part) for part in value.split(",")]

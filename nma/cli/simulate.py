@@ -102,7 +102,7 @@ def _vectors(space, params, material, draw, population, seed):
         try:
             with files.arrays(params) as f:
                 vectors, named = np.asarray(f["params"], np.float64), class_entry(f)
-        except Exception as e:  # also zipfile.BadZipFile, for a damaged archive
+        except Exception as e:  # damaged archives raise zipfile.BadZipFile
             raise TableError(
                 f"{params} is not an .npz file with an array `params` of shape (n, {space.size}): {e}"
             ) from None

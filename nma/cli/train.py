@@ -88,7 +88,7 @@ def train(
 
 
 def _training_data(class_name: str, data: Path | None, stream: int, walks: int, seed: int):
-    """The tables of a dataset, or the settings of a stream of materials; and a record of where the tables come from."""
+    """Returns a dataset's tables, or the settings of a stream of materials, and a record of their origin."""
     from nma.table.dataset import Dataset, Settings
 
     if (data is None) == (stream == 0):

@@ -12,7 +12,7 @@ _LAST = 500
 
 
 def of_variant(variant: str, target: str | None, instances: int | None = None) -> dict[str, Any]:
-    """The fields of a recipe that a variant of the paper sets; `target` and `instances` take precedence if given."""
+    """The fields of a recipe that the option --variant sets. `target` and `instances`, if given, override it."""
     count, directional = options.VARIANTS[variant]
     if not directional:
         # If the parameters do not depend on the view direction, lobes cannot be stretched along the plane of incidence.
@@ -31,7 +31,7 @@ def finish(adapter: Any, run: Any, output: Path) -> None:
 
 
 def losses(run: Any, output: Path) -> tuple[float, Path]:
-    """The mean log loss of the last steps, and the path of the plot of all steps, which is drawn beside the weights."""
+    """The mean log loss of the last steps, and the path of the plot of the loss, which this function writes."""
     from nma.train.plot import plot_losses
 
     last = run.log_losses[-_LAST:]
