@@ -52,7 +52,10 @@ def choice(help: str, *values: str) -> Any:
 
 
 def ending(path: Path, endings: Iterable[str]) -> str | None:
-    """The ending of a file's name out of `endings`, or None. If `.json` and `.blend.json` fit, it is the longer one."""
+    """The element of `endings` with which the file's name ends, or None.
+
+    If several elements fit, such as `.json` and `.blend.json`, returns the longest element.
+    """
     fitting = [text for text in endings if path.name.endswith(text) and path.name != text]
     return max(fitting, key=len, default=None)
 

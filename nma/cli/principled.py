@@ -21,7 +21,7 @@ ALBEDO_LIMIT = 0.05
 
 
 class Text(NamedTuple):
-    """A kind of text file: the renderer that reads it, and the function that returns its content."""
+    """A text format: the renderer that reads the format, and the function that returns the content of a file."""
 
     renderer: str
     of: Callable[[Principled], str]
@@ -39,9 +39,9 @@ def _json(fitted: Principled) -> str:
     return principled_json(fitted)
 
 
-# The text formats, by the ending of a file's name. If two endings fit a name, the longer ending is used. A renderer whose
-# files are also JSON therefore needs a longer ending, such as `.blend.json`. The functions of the formats import their
-# modules only when they are called, so that `nma --help` is quick.
+# The text formats, by the ending of a file's name. If two endings fit a name, the longer ending is used. A renderer
+# whose files are also JSON therefore needs a longer ending, such as `.blend.json`. The functions of the formats import
+# their modules only when they are called, so that `nma --help` is quick.
 _TEXTS = {".xml": Text("Mitsuba", _xml), ".json": Text("Mitsuba", _json)}
 
 

@@ -102,7 +102,8 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
     path = _path(source, material)
     if path.suffix == ".npz" and path.is_file() and _holds_tables(path):
         raise TableError(
-            f"{path} holds tables, whose bins are too wide; fit an adapter first: nma fit {path} -o X.safetensors"
+            f"{path} holds tables, whose bins are too wide for single BRDF values; "
+            f"fit an adapter first: nma fit {path} -o X.safetensors"
         )
     if path.suffix == ".safetensors":
         return AdapterValues(Adapter.load(path), name=path.stem)
