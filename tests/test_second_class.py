@@ -8,11 +8,13 @@ import sys
 import numpy as np
 import pytest
 
+import nma.render
 from nma import sources
 from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.export import FILES
 from nma.params import LAYERED3
+from nma.render.load import SceneError, load_dict
 from nma.table import ISOTROPIC, Tables
 from nma.table.dataset import Settings
 from nma.train.recipe import CLASS, PAPER, for_class
@@ -105,6 +107,37 @@ def test_files_of_tables_name_the_class(bare, nma):
         code, _, told = nma(*command.split())
         assert code == 1 and advice in told and told.count("\n") == 1, told
     assert nma(*"simulate --class bare --params drawn.npz --walks 1600 -o again.npz".split())[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "advice"),
+    [
+        (
+            "render steel.toml",
+            "the adapter layered3-5x64 is for class layered3; take an adapter of class bare",
+        ),
+        (
+            "render steel.toml --model layered",
+            "simulates only class layered3; `nma simulate` makes a table of steel",
+        ),
+        ("compare steel.toml", "take an adapter of class bare: `nma train` makes one, and `nma fit`"),
+        ("data merl steel.toml -o x.binary", "take an adapter of class bare"),
+    ],
+)
+def test_a_material_of_the_class_is_refused_where_another_class_is_needed(bare, nma, command, advice):
+    code, _, told = nma(*command.split())
+    assert code == 1
+    assert "steel" in told and "is of class bare" in told and advice in told
+    assert told.count("\n") == 1 and "clamp" not in told
+
+
+def test_a_scene_refuses_a_material_of_another_class(bare):
+    nma.render.use("llvm_ad_rgb")
+    for model in ("nma", "layered"):
+        with pytest.raises(
+            SceneError, match="is of class bare, but this BSDF needs class layered3; take a material"
+        ):
+            load_dict({"type": model, "material": str(bare)})
 
 
 @pytest.mark.parametrize("command", ["fit x.npz -o x.safetensors", "principled x.npz"])

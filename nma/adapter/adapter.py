@@ -151,6 +151,14 @@ class Adapter:
             return None
         return np.asarray(fitted, np.float64)
 
+    def check_class(self, class_name: str, material: str, name: str) -> None:
+        """Raises `ParamError` if a material has another class than this adapter. The message uses both names."""
+        if class_name != self.space.name:
+            raise ParamError(
+                f"{material} is of class {class_name}, but the adapter {name} is for class {self.space.name}; take an "
+                f"adapter of class {class_name}: `nma train` makes one, and `nma fit` one for {material} alone"
+            )
+
     def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
         """Checks the parameters `params` of n materials and returns them as float64 (n, columns).
 

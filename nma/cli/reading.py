@@ -109,6 +109,7 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
         return AdapterValues(Adapter.load(path), name=path.stem)
     if is_material(source):
         known, network = materials.load(source), Adapter.load(adapter)
+        network.check_class(known.class_name, source, adapter)
         return AdapterValues(network, network.check(known.vector(), clamp)[0], known.name)
     return _values(path, material)[0]
 

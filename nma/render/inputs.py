@@ -314,7 +314,8 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     material = materials.load(str(found))
     if material.class_name != space.name:
         raise ParamError(
-            f"material '{name}' is of class {material.class_name}, but this BSDF needs class {space.name}"
+            f"material '{name}' is of class {material.class_name}, but this BSDF needs class {space.name}; "
+            f"take a material of class {space.name}, or an adapter of class {material.class_name}"
         )
     return {
         key: mi.load_dict(bitmap_texture(value.read(), scale=value.uv_scale))

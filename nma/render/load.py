@@ -8,9 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from nma.adapter import Adapter
 from nma.errors import NmaError, ParamError, either, one_line
 from nma.images.io import check_size
 from nma.materials import Material, Texture
+from nma.params import LAYERED3
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.textures import bitmap_texture
 
@@ -36,11 +38,20 @@ def material_bsdf(
         clamp: whether parameters outside the adapter's training range are clamped to that range instead of refused.
 
     Raises:
-        ParamError: the model is unknown.
+        ParamError: the model is unknown, or the material is of another class than the adapter or than "layered".
+        WeightsError: there is no such adapter.
         TextureError: a texture cannot be read, or holds values that are not allowed.
     """
     if model not in MODELS:
         raise ParamError(f"unknown model {model!r}; take {either(MODELS)}")
+    if model == "nma":
+        Adapter.load(adapter).check_class(material.class_name, material.name, str(adapter))
+    elif material.class_name != LAYERED3.name:
+        raise ParamError(
+            f"{material.name} is of class {material.class_name}, but the BSDF 'layered' simulates only class "
+            f"{LAYERED3.name}; `nma simulate` makes a table of {material.name}, and `nma evaluate` compares an adapter "
+            "with it"
+        )
     settings = {"adapter": str(adapter), "clamp": clamp} if model == "nma" else {}
     return {"type": model, **settings} | {name: _value(value) for name, value in material.values.items()}
 
