@@ -66,6 +66,19 @@ def random_directions(rng: np.random.Generator, n: int) -> Vec3:
     return Vec3(sin_theta * np.cos(phi), sin_theta * np.sin(phi), z)
 
 
+def horizon_pairs():
+    """Returns pairs of directions, wi (n, 3) and wo (n, 3), of which at least one is at or below the horizon.
+
+    The other direction of a pair may be anywhere. Some pairs are opposite directions, and some have equal directions.
+    """
+    z = np.array([1.0, 0.5, 1e-9, 1e-20, 0.0, -0.0, -1e-20, -1e-9, -0.5, -1.0])
+    one = np.stack([np.sqrt(1.0 - z * z), 0.0 * z, z], axis=-1)
+    wi = np.tile(np.repeat(one, len(z), axis=0), (2, 1))
+    wo = np.concatenate([np.tile(one * side, (len(z), 1)) for side in ([1, 1, 1], [-1, 1, 1])])
+    hidden = (wi[:, 2] <= 0) | (wo[:, 2] <= 0)
+    return wi[hidden], wo[hidden]
+
+
 def mapped(tree, f):
     """Applies `f` to every array in nested tuples, and returns the new tuples. Python numbers remain unchanged."""
     if isinstance(tree, tuple):

@@ -10,7 +10,7 @@ from functools import cache
 import mitsuba as mi
 import numpy as np
 import pytest
-from target_cases import random_directions, stacked
+from target_cases import horizon_pairs, random_directions, stacked
 
 import nma.render
 from nma import target
@@ -73,6 +73,21 @@ def turned(v, angle):
 def pairs(n=2000):
     rng = np.random.default_rng(2)
     return random_directions(rng, n), random_directions(rng, n)
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_at_the_horizon_and_below_all_is_zero_without_a_warning(kind, precision):
+    """Values and densities are 0 if `wi` or `wo` is at the horizon or below, also straight below."""
+    wi, wo = (Vec3(*w.astype(precision).T) for w in horizon_pairs())
+    brdf = prepared(kind, wi)
+    assert not np.any(stacked(brdf.eval(wi, wo))) and not np.any(brdf.pdf(wi, wo))
+    value, pdf = brdf.eval_pdf(wi, wo)
+    assert not np.any(stacked(value)) and not np.any(pdf)
+    for u in ((0.1, 0.2, 0.3), (0.5, 0.0, 0.0), (0.999, 0.5, 0.999)):
+        wo, value, pdf = brdf.sample(wi, *(x + 0.0 * wi.z for x in u))
+        assert np.isfinite([*stacked(wo), *stacked(value), pdf]).all()
+        assert not np.any(stacked(value)[:, wi.z <= 0]) and not np.any(pdf[wi.z <= 0])
 
 
 @pytest.mark.parametrize("azimuth", AZIMUTHS)

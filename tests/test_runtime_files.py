@@ -51,6 +51,10 @@ def changed(name, **fields):
     return packed(header, about | fields, data)
 
 
+TARGET = header_of("layered3-3x32")[1]["target"]
+BASE_COLOR = TARGET[0]
+
+
 def ranged(group, number, **fields):
     """Returns a weights file with a changed declaration of a parameter, in the group `parameters` or `target`."""
     about = header_of("layered3-3x32")[1]
@@ -106,10 +110,17 @@ def nested(depth):
         (changed("layered3-3x32", instances=1), "does not fit its description"),
         (changed("layered3-3x32", hidden=[32, 32, 31]), "hidden layers"),
         (changed("layered3-3x32", hidden="many"), "'hidden'"),
-        (changed("layered3-3x32", target=[]), "does not fit its description"),
+        (changed("layered3-3x32", target=[]), "target parameters must have a base_color, and no name twice"),
+        (changed("layered3-3x32", target=[BASE_COLOR]), "does not fit its description"),
+        (changed("layered3-3x32", target=[*TARGET[:3], *TARGET[1:]]), "base_color, and no name twice"),
+        # As many outputs as the network has: the sheen takes the place of the sheen's tint.
+        (
+            changed("layered3-3x32", target=[*TARGET[:6], TARGET[5], *TARGET[7:]]),
+            "base_color, and no name twice",
+        ),
         (changed("layered3-3x32", encoding="azimuth"), "does not fit its description"),
         (
-            changed("layered3-3x32", encoding="azimuth", target=[IN_PLANE]),
+            changed("layered3-3x32", encoding="azimuth", target=[BASE_COLOR, IN_PLANE]),
             "lobes stretch along the plane of incidence",
         ),
         (changed("layered3-3x32", encoding="azimuth", directional=False), "does not read the view direction"),

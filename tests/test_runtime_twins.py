@@ -5,12 +5,13 @@ CONTRIBUTING.md lists all twins.
 
 import ctypes
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from runtime_cases import built, in_single_precision, pointer, rows
-from target_cases import random_directions
+from target_cases import horizon_pairs, random_directions
 
 import nma
 from nma import Runtime, sources
@@ -89,6 +90,35 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
         # The error is relative to the largest number in the computation, which is the width of the range.
         error = np.abs(found - wanted) / (np.abs(wanted) + np.maximum(np.ptp(wanted, axis=0), 1.0))
         assert error.max() < 1e-6, instruction_set
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize("name", TARGETS)
+def test_at_the_horizon_and_below_all_is_zero(tmp_path, name, bounded):
+    """Python has the same rule: test_brdf.py checks it."""
+    kind, rng = "azimuth" if name == "anisotropic" else "direction", np.random.default_rng(3)
+    size, inputs = output_size(2, TARGETS[name]), encoding.size(kind, MEASURED, True)
+    path = saved(
+        tmp_path,
+        MEASURED,
+        kind,
+        2,
+        True,
+        TARGETS[name],
+        rng.normal(size=(size, inputs)),
+        rng.normal(size=size),
+    )
+    replace(nma.Adapter.load(path), bounded=bounded).save(path)
+    wi, wo = (w.astype(np.float32) for w in horizon_pairs())
+    hidden, u = wi[:, 2] <= 0, rng.random((len(wi), 3))
+    for instruction_set in in_single_precision():
+        runtime = Runtime(path, instruction_set)
+        brdfs = runtime.prepare(np.zeros((len(wi), 0)), wi)
+        assert not np.any(np.column_stack(runtime.eval_pdf(brdfs, wi, wo)))
+        sampled = np.column_stack(runtime.sample(brdfs, wi, u))
+        assert np.isfinite(sampled).all() and not sampled[hidden, 3:].any()
+        albedo = runtime.albedo(brdfs, wi)
+        assert np.isfinite(albedo).all() and not albedo[hidden].any()
 
 
 @pytest.mark.parametrize(

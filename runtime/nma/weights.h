@@ -228,6 +228,20 @@ inline TargetParam target_param(const Json& entry) {
     return p;
 }
 
+// All parameters of the target.
+inline std::vector<TargetParam> target_params(const Json& about) {
+    std::vector<TargetParam> found;
+    bool colour = false, twice = false;
+    for (const Json& entry : about.at("target", Json::Kind::Array).items) {
+        const TargetParam p = target_param(entry);
+        colour |= p.name == "base_color";
+        for (const TargetParam& other : found) twice |= other.name == p.name;
+        found.push_back(p);
+    }
+    if (!colour || twice) throw Error("target parameters must have a base_color, and no name twice");
+    return found;
+}
+
 // The parameters of the single material that the network was fitted to, from the file's record of its training. The
 // result is empty if the network reads parameters, or if the file has no record of a material.
 inline std::vector<float> material(const Json& about, const Weights& made) {
@@ -264,7 +278,7 @@ inline Weights weights(const char* bytes, std::size_t size) {
     made.bounded = flag(about, "bounded");
     for (const Json& entry : about.at("parameters", Json::Kind::Array).items)
         made.parameters.push_back(source_param(entry));
-    for (const Json& entry : about.at("target", Json::Kind::Array).items) made.target.push_back(target_param(entry));
+    made.target = target_params(about);
     made.material = material(about, made);
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
