@@ -141,7 +141,7 @@ def _try_folder(folder: Path, *names: str) -> None:
 
 
 def _place(path: Path) -> Path:
-    """The path of the file that is replaced. For a symbolic link, this is the path of its target, so the link stays."""
+    """The path of the file that is replaced. For a symbolic link, the link's target is replaced and the link stays."""
     return Path(os.path.realpath(path))
 
 

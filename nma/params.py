@@ -21,7 +21,7 @@ Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
 Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
 Range = Literal["training", "valid"]
 
-# A parameter may exceed a bound by this much, or by this share of the range if the range is narrower than 1. Textures
+# A parameter may exceed a bound by ROUNDING, or by ROUNDING times the range if the range is narrower than 1. Textures
 # and other languages store parameters in single precision, whose rounding moves the bounds of our classes by up to
 # 1e-7.
 ROUNDING = 1e-6
@@ -269,8 +269,8 @@ LAYERED3 = ParamSpace(
 # The class of materials that have no parameters, only BRDF values: measured, tabulated, or from another program's BSDF.
 MEASURED = ParamSpace("measured", ())
 
-# The class of the materials of a library (`nma.adapter.library`). Its only parameter is the learned code of a material.
-# The single numbers of a code have no meaning.
+# The class of the materials of a library (`nma.adapter.library`). The only parameter of this class is the learned code
+# of a material. The single numbers of a code have no meaning.
 CODE_BOUND = 4.0
 LIBRARY = ParamSpace(
     "library",

@@ -33,7 +33,7 @@ from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
-# Two parameters count as equal if their relative difference is less than this, because single precision rounds them.
+# Two parameters count as equal if their relative difference is less than SAME, because single precision rounds them.
 SAME = 1e-5
 
 

@@ -18,9 +18,9 @@ from nma.params import LAYERED3, ParamSpace
 # Isotropic encodings use only wi.z, which is cos(theta_i).
 Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
-# The cosine of 84 degrees. Near this angle, the reflectance of metals has a minimum, before it rises to 1.
+# The cosine of 84 degrees, near which the reflectance of metals has a minimum before it rises to 1.
 GRAZING = 0.1045
-# The smallest cosine of the refracted direction that is used. Smaller cosines are replaced by this value.
+# The smallest cosine of the refracted direction that is used, in place of smaller cosines.
 MIN_COS_T = 0.05
 
 

@@ -60,7 +60,7 @@ class Library:
             names = None
         if adapter.space != LIBRARY or codes is None or names is None:
             raise WeightsError(
-                f"{path}: an adapter of class {adapter.space.name}, not a library; `nma train-library` makes one"
+                f"{path}: an adapter of class {adapter.space.name}, not a library; `nma train-library` makes libraries"
             )
         try:
             library = Library(adapter, tuple(names), codes)
@@ -70,7 +70,7 @@ class Library:
         return library
 
     def save(self, path: str | Path) -> None:
-        """Writes a weights file, atomically. `Adapter.load` and the C++ runtime also read such files."""
+        """Writes a weights file, atomically. `Adapter.load` and the C++ runtime also read the files of libraries."""
         training = {**self.adapter.training, "names": list(self.names)}
         replace(self.adapter, training=training).save(path, {CODES: self.codes})
 

@@ -1,4 +1,4 @@
-"""Reads and writes weights files. These are safetensors files whose header describes the network in JSON.
+"""Reads and writes weights files, which are safetensors files whose header describes the network in JSON.
 
 The tensors are float32: `layer0.weight` (out, in), `layer0.bias` (out,), `layer1.weight` and so on. The file of a
 library (`nma.adapter.library`) also has the tensor `codes`. The metadata in the header has one entry, `nma`: a JSON

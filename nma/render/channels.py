@@ -43,8 +43,8 @@ def channel_names(scene: Any, count: int, sensor: int = 0) -> list[str]:
 def colours(image: NDArray[np.float32], names: list[str]) -> NDArray[np.float32]:
     """The colours of a picture, as linear sRGB (height, width, 3).
 
-    If `names` says that the first three channels are RGB or XYZ, these channels are returned as RGB. Otherwise the
-    first channel is returned as grey.
+    If `names` says that the first three channels are RGB or XYZ, these channels are returned as RGB. If the first three
+    channels are neither RGB nor XYZ, the first channel is returned as grey.
     """
     if names[:3] == _RGBA[:3]:
         return image[..., :3]

@@ -294,8 +294,8 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
 
 
 def _setting(props: Any, name: str, default: Any) -> Any:
-    """Reads a property that is not a parameter. Its type must be the type of `default`, or else the text "false" would
-    count as true."""
+    """Reads a property that is not a parameter. The property must have the type of `default`, or else the text "false"
+    would count as true."""
     value = props.get(name, default)
     if not isinstance(value, type(default)):
         wanted = "true or false (boolean)" if isinstance(default, bool) else "a name (string)"

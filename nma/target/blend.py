@@ -91,8 +91,8 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
     invalid)."""
     view = Vec3(wi.x, wi.y, ops.select(wi.z > MIN_COS, wi.z, 1.0))
     probabilities = lobe_probabilities(blend, view.z)
-    # `u_lobe` selects a lobe by its interval in [0, 1): first those of all diffuse lobes, then all specular lobes, then
-    # all clearcoats.
+    # Each lobe has an interval of [0, 1), and `u_lobe` selects the lobe whose interval contains `u_lobe`. All diffuse
+    # lobes come first, then all specular lobes, then all clearcoats.
     spec_start = sum(p.diffuse for p in probabilities)
     clearcoat_start = spec_start + sum(p.spec for p in probabilities)
     (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)

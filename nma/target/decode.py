@@ -186,7 +186,7 @@ def decode(
 
 
 def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
-    """Raw outputs that `decode` converts to nearly this blend. A fit can start from these outputs."""
+    """Raw outputs that `decode` converts to nearly this blend, for example as the start of a fit."""
     raw: list[Float] = []
     for p in blend.instances:
         for param in params:
@@ -202,8 +202,8 @@ def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> l
 def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
     """The blend as a flat list: all parameters, then all weights except the last.
 
-    Curves over cos(theta_i) interpolate such lists, because every convex combination of such lists describes a valid
-    blend.
+    Curves over cos(theta_i) interpolate these flat lists, because every convex combination of flat lists describes a
+    valid blend.
     """
     flat: list[Float] = []
     for p in blend.instances:

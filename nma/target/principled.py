@@ -192,7 +192,8 @@ def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms
     """
     tinted = (1.0 - p.metallic) * p.spec_tint
     plain = (1.0 - p.metallic) - tinted
-    # The metal and the tinted dielectric use Schlick's F0 + (1 - F0) weight. Here f0 is the sum of both F0.
+    # The metal and the tinted dielectric use Schlick's F0 + (1 - F0) weight. The variable f0 is the sum of their F0,
+    # weighted with `metallic` and `tinted`.
     f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
     white = (
         plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight
@@ -212,7 +213,7 @@ def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
     # Density of directions reflected about visible normals: D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
     spec_pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
-    # The value is this density times the masking of `wo` and the Fresnel term. Walter 2007, eq. 20.
+    # The value is the density `spec_pdf` times the masking of `wo` and the Fresnel term. Walter 2007, eq. 20.
     spec = spec_pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y))
     # Density of directions reflected about normals drawn from D cos(theta_h): D cos(theta_h) / (4 cos_d).
     clearcoat_d = gtr1_d(g.h, clearcoat_alpha(p.clearcoat_gloss))
