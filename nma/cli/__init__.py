@@ -35,13 +35,14 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    help="Neural Material Adapter: expensive materials, translated into blends of Principled BRDFs "
-    "by a tiny network.\n\n"
-    "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. Simulate with [bold]simulate[/bold] and "
-    "[bold]dataset[/bold], learn with [bold]train[/bold], [bold]fit[/bold] and [bold]train-library[/bold], "
-    "judge with [bold]evaluate[/bold] and [bold]compare[/bold], look with [bold]render[/bold]. [bold]data[/bold] lists "
-    "measured materials. [bold]library[/bold] adds materials to a library and takes some out. [bold]principled[/bold] "
-    "fits one plain Principled BRDF. [bold]mitsuba build[/bold] compiles plugins for the scalar renderer.",
+    help="Neural Material Adapter: replaces the simulation of layered materials by a tiny network and a blend of "
+    "Principled BRDFs.\n\n"
+    "Start with [bold]nma demo[/bold] and [bold]nma materials[/bold]. [bold]simulate[/bold] and [bold]dataset[/bold] "
+    "simulate materials. [bold]train[/bold], [bold]fit[/bold] and [bold]train-library[/bold] train adapters. "
+    "[bold]evaluate[/bold] and [bold]compare[/bold] measure errors. [bold]render[/bold] renders pictures. "
+    "[bold]data[/bold] lists measured materials. [bold]library[/bold] adds materials to a library and extracts them. "
+    "[bold]principled[/bold] fits one Principled BRDF with constant parameters. [bold]mitsuba build[/bold] compiles "
+    "plugins for Mitsuba's scalar renderer.",
 )
 # The files of this folder that define commands, in the order of `nma --help`, which lists single commands before groups
 # of commands.
