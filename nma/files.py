@@ -155,7 +155,7 @@ def _check_place(path: Path) -> None:
 
 def _partial(path: Path) -> Path:
     """A short, unique name for a temporary file in the folder of `path`, with the suffix of `path`."""
-    return path.with_name(f".nma-{secrets.token_hex(6)}.partial{path.suffix}")
+    return path.parent / f".nma-{secrets.token_hex(6)}.partial{path.suffix}"
 
 
 def _refused(path: Path, error: OSError) -> NmaError:

@@ -37,6 +37,17 @@ def places(tmp_path) -> dict[str, Path]:
     }
 
 
+@pytest.mark.parametrize("path", ["", ".", "/", ".."])
+@pytest.mark.parametrize("write", [try_file, lambda path: write_bytes(path, b"content")])
+def test_a_path_without_a_name_is_refused_as_a_folder(tmp_path, monkeypatch, path, write):
+    for folder in (tmp_path, Path("/")):
+        monkeypatch.chdir(folder)
+        with pytest.raises(
+            OutputError, match="cannot be written .a folder has this name.; choose another place"
+        ):
+            write(path)
+
+
 @pytest.mark.parametrize("write", [try_file, lambda path: write_bytes(path, b"content")])
 def test_an_unwritable_path_is_refused_in_one_line_that_says_why(places, tmp_path, write):
     before = contents(tmp_path)

@@ -8,6 +8,7 @@ the file's name to `COMMANDS`.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from importlib import import_module
 from typing import Annotated, Any, NoReturn
@@ -84,6 +85,8 @@ def _options(
 
 def main() -> None:
     """The entry point of the program `nma`. Expected errors are printed as one line on stderr, with exit status 1."""
+    # Without a handler, SIGTERM ends the process at once, and files that are being written stay behind.
+    signal.signal(signal.SIGTERM, lambda number, frame: _interrupted(128 + number))
     try:
         try:
             app()
@@ -113,12 +116,13 @@ def _fail(message: str) -> NoReturn:
     sys.exit(1)
 
 
-def _interrupted() -> NoReturn:
+def _interrupted(status: int = 130) -> NoReturn:
+    """Ends the command after Ctrl-C or SIGTERM. The exit status is 128 plus the number of the signal."""
     print(
         "nma: interrupted; run the same command again to go on from what it has kept",
         file=sys.stderr,
     )
-    sys.exit(130)
+    sys.exit(status)
 
 
 def _close_stdout() -> None:
