@@ -47,7 +47,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def weights_file(name_or_path: str | Path) -> Path:
-    """The path of the weights file of a shipped adapter. A name that no shipped adapter has is itself a path."""
+    """The path of the weights file of a shipped adapter. Any other name is returned as a path."""
     if str(name_or_path) in shipped():
         return Path(str(_SHIPPED.joinpath(f"{name_or_path}.safetensors")))
     return Path(name_or_path)

@@ -65,7 +65,7 @@ class Curves:
         flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
-                change = columns[k] - dr.detach(columns[k])  # 0, with the derivative of columns[k]
+                change = columns[k] - dr.detach(columns[k])  # zero, but with the derivative of columns[k]
                 steps = self._looked_up(slope, wi.z, active)
                 flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
         return self.adapter.from_numbers(flat, wi)
