@@ -1,11 +1,12 @@
-"""Shared by the benches that render whole frames: rendering with independent seeds, variance, error and efficiency.
+"""Functions for the benches that render whole frames: rendering with independent seeds, variance, error, efficiency.
 
 The quality of a frame is measured by its variance and by its squared error. The variance is computed over frames with
 independent seeds, and averaged over pixels and channels; it measures noise only. The squared error is the mean squared
-difference between a frame and a converged picture of `layered`. The squared error of an adapter contains noise and
-bias. The converged picture also has noise; this noise is estimated from the picture's independent parts, and
-subtracted. `layered` has no bias, so its expected squared error equals its variance. The efficiency by variance is
-1 / (variance x seconds), the efficiency by error is 1 / (squared error x seconds).
+difference between a frame and a converged picture, rendered with the simulation `layered`. The squared error of an
+adapter contains noise and bias. The converged picture also has noise. The noise of the converged picture is estimated
+from the picture's independent parts, and subtracted from the squared error. `layered` has no bias, so its expected
+squared error equals its variance. The efficiency by variance is 1 / (variance x seconds), the efficiency by error is
+1 / (squared error x seconds).
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from nma.render.statistics import render_seconds
 
 ROOT = Path(__file__).parents[1]
 Array = NDArray[np.float64]
-Row = Mapping[str, Any]  # error measures and times by name; None stands for an unknown value
+Row = Mapping[str, Any]  # times, variances and errors by name; None is an unknown value
 SCALAR, VECTORISED = "scalar_rgb", "llvm_ad_rgb"
 OUTPUT = Path("out/bench")
 REFERENCES = ROOT / "out/bench/references"
 # Frames with more than MOST_SAMPLES samples are rendered in several passes, to limit memory use.
 MOST_SAMPLES = 1 << 23
-# A converged picture is the mean of independent parts; the variance of the parts gives the noise of the mean.
-# PARTS is the number of parts for most scenes, TEASER_PARTS the number of parts for the teaser.
+# A converged picture is the mean of independent parts; the variance of the parts gives the noise of the mean. PARTS is
+# the number of parts for most scenes, TEASER_PARTS the number of parts for the scene of bench/teaser.py.
 PARTS, TEASER_PARTS = 4, 16
 # Converged pictures use seeds from REFERENCE_SEED upwards, frames use smaller seeds.
 REFERENCE_SEED = 1_000_000
@@ -88,7 +89,7 @@ def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[
 def _turns(
     scenes: Mapping[str, Mapping[str, Any]], spp: int
 ) -> Callable[[str, int], tuple[Array, float, float]]:
-    """Returns a function that renders a frame for a scene's name and a seed, and returns the result of `timed`."""
+    """Returns a function of a scene's name and a seed. The function returns the result of `timed`."""
     import mitsuba as mi
 
     if mi.variant() == SCALAR:
@@ -96,8 +97,9 @@ def _turns(
         return lambda name, seed: timed(loaded[name], spp, seed)
 
     def alone(name: str, seed: int) -> tuple[Array, float, float]:
-        # A vectorised renderer traces the code of every BSDF in memory, so only one scene may be loaded at a time. The
-        # first frame compiles the kernel, or loads the kernel from Dr.Jit's cache, so this frame is not measured.
+        # A vectorised renderer compiles all BSDFs that are in memory into one kernel, so only one scene may be loaded
+        # at a time. The first frame is not measured, because its time includes compiling the kernel or loading the
+        # kernel from Dr.Jit's cache.
         gc.collect()
         scene = load_dict(scenes[name])
         timed(scene, spp, seed)
@@ -155,7 +157,7 @@ def converged(
 
 
 def converged_teaser(description: Mapping[str, Any], arguments: argparse.Namespace) -> Converged:
-    """Returns the converged picture of the teaser, and stores the picture's parts in the folder REFERENCES."""
+    """Returns the converged picture of the teaser scene, and stores the picture's parts in the folder REFERENCES."""
     settings = f"{arguments.size}px_rr-{arguments.rr_depth}_{arguments.variant}"
     keep = REFERENCES / f"teaser-{digest()}_{settings}"
     with bar("converged picture", "parts", TEASER_PARTS) as advance:
@@ -181,7 +183,7 @@ def figures(frames: Frames, reference: Converged | None = None) -> dict[str, flo
 
 
 def ratios(own: Row, simulation: Row) -> dict[str, Any]:
-    """Returns the ratios of time, variance, error and efficiencies to the simulation's; an unknown ratio is None."""
+    """Returns time, variance, error and efficiencies divided by those of the simulation; an unknown ratio is None."""
     time, variance, error = (ratio(own[key], simulation[key]) for key in ("seconds", "variance", "error"))
     return {
         "time": time,
@@ -193,7 +195,7 @@ def ratios(own: Row, simulation: Row) -> dict[str, Any]:
 
 
 def ratio(a: float | None, b: float | None) -> float | None:
-    """Returns a / b, or None if a or b is None or not positive. Noise can make a small error negative."""
+    """Returns a / b, or None if a or b is None or not positive. Subtracting noise can make a squared error negative."""
     return a / b if a and b and a > 0.0 and b > 0.0 else None
 
 
@@ -204,7 +206,7 @@ def geometric_mean(values: Iterable[float | None]) -> float | None:
 
 
 def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str, dict[str, Any]]:
-    """Returns the ratios of every BSDF to the simulation, as geometric means over materials."""
+    """Returns the results of `ratios` for every BSDF, as geometric means over materials."""
     each = [{name: ratios(row[name], row[simulation]) for name in row} for row in rows]
     return {
         name: {key: geometric_mean(row[name][key] for row in each) for key in each[0][name]}
@@ -213,7 +215,7 @@ def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str,
 
 
 def mean_doubt(rows: Sequence[Mapping[str, Row]], name: str, simulation: str) -> float | None:
-    """Returns the relative standard error of the mean ratio of squared errors, or None if an error was not measured."""
+    """Returns the relative standard error of the mean ratio of squared errors, or None if an error is unknown."""
     doubts = [row[bsdf]["doubt"] for row in rows for bsdf in (name, simulation)]
     return None if None in doubts else math.hypot(*doubts) / len(rows)
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 
 def header() -> str:
-    """Returns lines with the processor and its cores, the load average, Python's version, and the command."""
+    """Returns lines of text: the processor and its number of cores, the load average, Python's version, the command."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        # Virtual machines often hide the processor's name, so its family is shown. AMD's family 25 is Zen 3 or Zen 4,
-        # and AMD's family 26 is Zen 5.
+        # Virtual machines often hide the processor's name, so the processor's family is shown too. AMD's family 25 is
+        # Zen 3 or Zen 4, and AMD's family 26 is Zen 5.
         fields = dict(re.findall(r"^(.*?)\s*: (.*)$", cpuinfo.read_text(), re.MULTILINE))
         names = [
             fields.get("model name"),

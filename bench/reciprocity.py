@@ -4,8 +4,8 @@ python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick
 
 An adapter's network computes the blend's parameters for the view direction, so f(wi, wo) and f(wo, wi) differ. Paths
 from the camera use f(wi, wo), paths from a light would use f(wo, wi). This bench needs no renderer: it averages f(wi,
-wo) and f(wo, wi) over directions wo that are sampled from the blend. The bench prints a table with a row for each named
-material and these columns:
+wo) and f(wo, wi) over directions wo that are sampled from the adapter's blend. The bench prints a table with a row for
+each named material and these columns:
 
 difference      mean of |f(wi, wo) - f(wo, wi)|, weighted by both cosines, divided by the mean of f
 cos .9, .5, .2  relative change of brightness if wi and wo are swapped, under a uniform sky, at this cosine of theta_i
@@ -86,19 +86,19 @@ def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Ge
     n = len(cosines)
     wi = at_azimuth_0(cosines)
     brdf = prepared(adapter, params, wi)
-    # The random numbers that choose the lobe are stratified.
+    # The random numbers that choose a lobe of the blend are stratified.
     u = rng.permutation((np.arange(n) + rng.random(n)) / n), *rng.random((2, n))
     wo, value, pdf = brdf.sample(wi, *u)
     valid = (pdf > 0.0) & (wo.z > 1e-4)
     wo = Vec3(*(np.where(valid, x, up) for x, up in zip(wo, (0.0, 0.0, 1.0), strict=True)))
-    # The swapped evaluation returns f(wo, wi) cos(theta_i); we need f(wo, wi) cos(theta_o).
+    # The swapped evaluation returns f(wo, wi) cos(theta_i); the factor wo.z / wi.z makes this f(wo, wi) cos(theta_o).
     back = np.stack(prepared(adapter, params, wo).eval(wo, wi)) * wo.z / wi.z
     weight = np.where(valid, 1.0 / np.where(valid, pdf, 1.0), 0.0)
     return Pairs(np.stack(value) * weight, back * weight)
 
 
 def prepared(adapter: Adapter, params: NDArray, w: Vec3) -> Brdf:
-    """Returns the BRDF of one material, prepared for the view directions `w`."""
+    """Returns the BRDF of one material, with the blend's parameters computed for the view directions `w`."""
     return adapter.prepare([np.full(len(w.z), x) for x in params], w)
 
 

@@ -13,10 +13,10 @@ bias        root mean square difference between the expected picture and the exp
 smape       SMAPE between the mean of the frames and the reference; in the row of `layered`, this error is noise only
 
 The bias is estimated from products of independent renderings. If the squared bias is at most twice its standard error,
-the table shows an upper limit of the bias (<).
+the table shows an upper limit of the bias, marked with <.
 
 The machine's load average is printed before and after the table. `principled` shows another material, so only its time
-and its noise are of interest.
+and its variance can be compared with the other BSDFs.
 
 Writes render.json and render.png. The plot shows the expected error against the rendering time; the expected error is
 computed from variance and bias.
@@ -108,9 +108,9 @@ def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def compile_seconds(description: dict[str, Any], spp: int) -> float:
-    """Returns how many seconds longer the first frame takes than the second.
+    """Returns the seconds of compilation: how much longer the first frame takes than the second.
 
-    Mitsuba compiles every BSDF in memory, so the BSDFs of other scenes are deleted first.
+    Mitsuba also compiles the BSDFs of other scenes if they are still in memory, so these BSDFs are deleted first.
     """
     gc.collect()
     scene = load_dict(description)
@@ -158,7 +158,7 @@ def squared_bias(pictures: Array, halves: list[Array]) -> tuple[float, float]:
     """Estimates the squared bias, averaged over pixels and channels, and the standard error of the estimate.
 
     The estimate is the mean of (a - halves[0]) (b - halves[1]) over all pairs (a, b) of different frames. The two
-    factors share no samples, so the noise has mean 0 in the product.
+    factors share no samples, so the expected value of each product contains no noise.
     """
     a, b = pictures - halves[0], pictures - halves[1]
     pairs = len(pictures) * (len(pictures) - 1)

@@ -3,7 +3,7 @@
 //
 //     ./runtime NAME=WEIGHTS ...
 //
-// Each measurement answers 240 random queries on one thread, many times. The result is the shortest time, in
+// Each measurement evaluates the same 240 random queries on one thread, many times. The result is the shortest time, in
 // nanoseconds per query.
 #include "nma.h"
 
@@ -24,8 +24,8 @@ volatile float sink;
 
 double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
-// Returns the shortest time, in nanoseconds per query, of several calls of `all`, a function that answers every query
-// once.
+// Calls the function `all`, which evaluates every query once, several times. Returns the shortest time in nanoseconds
+// per query.
 template <class F>
 double best(F all, int repetitions = REPETITIONS) {
     double least = 1e30;
@@ -172,8 +172,8 @@ void time_eigen(const std::string& name, const std::vector<int>& sizes) {
 }
 #endif
 
-// Returns the highest rate of this core, in multiply-adds per nanosecond, measured with independent chains of
-// multiply-adds.
+// Returns the highest rate of this core, in multiply-adds per nanosecond. The rate is measured with 12 independent
+// chains of multiply-adds.
 NMA_TARGET("avx512f,fma") double peak_avx512() {
 #ifdef NMA_X86
     __m512 sums[12];

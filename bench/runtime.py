@@ -3,7 +3,7 @@
 python -m bench.runtime [--json OUT.json]
 
 Times are in nanoseconds on one thread. Each time is the shortest of many repetitions. Eigen is measured if its headers
-are installed (Debian: libeigen3-dev). The decoder has 1.07 million parameters.
+are installed (Debian: libeigen3-dev). The large decoder has 1.07 million parameters.
 """
 
 from __future__ import annotations
@@ -65,8 +65,7 @@ def main() -> None:
 
 
 def cpp() -> list[dict]:
-    """Compiles bench/runtime.cpp for this machine, runs it, and returns its measurements. The runtime's
-    kernels choose their instruction set when the program runs."""
+    """Compiles and runs bench/runtime.cpp on this machine, and returns its measurements."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "runtime"
         flags = ["-std=c++17", "-O2", "-march=native", f"-I{build.sources()}"]

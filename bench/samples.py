@@ -25,7 +25,7 @@ import nma
 from bench import frames, scenes
 from figures import common
 
-# With few samples per pixel (spp), CHEAP / spp times as many frames are rendered.
+# With fewer than CHEAP samples per pixel (spp), CHEAP / spp times as many frames are rendered.
 CHEAP = 32
 Curve = dict[int, dict[str, float | None]]
 
@@ -77,7 +77,7 @@ def measure(
 
 
 def repeats(spp: int, runs: int) -> int:
-    """Returns how many frames to render: more frames with few samples, which take little time and vary most."""
+    """Returns how many frames to render: more with few samples per pixel, because such frames vary most."""
     return runs * max(1, CHEAP // spp)
 
 
@@ -87,7 +87,7 @@ def levels(spp: int) -> list[int]:
 
 
 def table(curves: dict[str, Curve]) -> str:
-    """Returns a table by samples per pixel: the simulation's results, and the adapters' ratios to the simulation."""
+    """Returns a table by samples per pixel: the simulation's results, and the adapters' results divided by these."""
     truth = curves[scenes.SIMULATION]
     headings, rows = ["spp", "seconds", "variance", "error"], []
     for name in curves:

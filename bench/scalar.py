@@ -6,9 +6,10 @@ python -m bench.scalar [--scene sphere|environment|preview|lights] [--materials 
 For each material, every run renders one frame with each BSDF, so that other load on the machine slows all BSDFs alike.
 The time of a BSDF is the median over its frames, rendered on all cores. bench/frames.py defines variance, error and
 efficiency. The error is measured for the first --error materials only. All results are ratios to `layered`, as
-geometric means over the materials. A time below 1 is faster, an efficiency above 1 is better. `online` runs the network
-at every shading point, `curves` runs no network. `principled` and `diffuse` show other materials: `principled` measures
-the time of a production BSDF, and `diffuse` the time of everything except the material.
+geometric means over the materials. A time below 1 is faster than the simulation, and an efficiency above 1 is better.
+An adapter marked `online` runs the network at every shading point, an adapter marked `curves` runs the network only
+when the scene is loaded. `principled` and `diffuse` show other materials. `principled` measures the time of a
+production BSDF, and `diffuse` measures the time of everything except the material.
 
 Writes scalar.json and scalar.png for the default scene, and scalar-SCENE.json and scalar-SCENE.png for another scene.
 """
@@ -79,10 +80,10 @@ def bsdfs(subject: scenes.Subject) -> dict[str, dict[str, Any]]:
 
 
 def compare(subject: scenes.Subject, number: int, arguments: argparse.Namespace) -> Figures:
-    """Returns seconds and variance of every BSDF; for the first --error materials, also the squared error."""
+    """Returns seconds and variance of every BSDF, and for the first --error materials the squared error as well."""
     size, scene = (arguments.size, arguments.size), scenes.SCENES[arguments.scene]
     described = {name: scene(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs(subject).items()}
-    # Each material has its own seeds, because equal seeds would give all materials similar noise.
+    # Each material is rendered with its own seeds, because equal seeds would give all materials similar noise.
     seeds = range(number * arguments.runs, (number + 1) * arguments.runs)
     measured = frames.in_turns(described, arguments.spp, seeds)
     reference = None

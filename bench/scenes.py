@@ -24,10 +24,11 @@ from nma.render.textures import bitmap_texture, periodic_noise, procedural_textu
 # The maximum path depth, and the depth at which Russian roulette begins (Mitsuba's default).
 DEPTH, RR_DEPTH = 6, 5
 SIMULATION, STAND_IN, NOTHING = "layered", "principled", "diffuse"
-# A frame with this BSDF measures the time of everything except the material, because its own cost is negligible.
+# A frame with this BSDF measures the time of everything except the material, because this BSDF takes almost no time.
 DIFFUSE = {"type": "diffuse"}
 TEXELS = 512
-# Small, bright lights that the camera does not see. For each light: direction from LIGHTS_AROUND, distance and colour.
+# Small, bright lights outside the camera's view. Each line is a light's direction and distance from the point
+# LIGHTS_AROUND, and its colour.
 LIGHTS = (
     ((-1.00, -0.70, 0.85), 2.4, (1.00, 0.85, 0.65)),
     ((0.80, -0.50, 0.55), 2.2, (0.70, 0.85, 1.00)),
@@ -37,7 +38,7 @@ LIGHTS = (
     ((0.25, -1.00, 0.75), 4.0, (1.00, 0.92, 0.80)),
 )
 LIGHTS_AROUND = (0.0, 0.0, 1.1)
-LIGHT_RADIUS, LIGHT_POWER = 0.06, 90.0  # the radiance is LIGHT_POWER x distance^2
+LIGHT_RADIUS, LIGHT_POWER = 0.06, 90.0  # a light's radiance is LIGHT_POWER x distance^2
 WIDE = Camera((0.0, -8.6, 3.0), (0.0, 0.0, 1.0), 18.2)
 TEASER_ASPECT = 20 / 9
 SOFT_BOX_PLACE, SOFT_BOX_SIZE, SOFT_BOX_RADIANCE = (-3.4, -3.6, 4.6), (1.6, 1.0, 1.0), 0.18
@@ -70,10 +71,10 @@ def adapter(subject: Subject, name: str, clamp: bool = False) -> dict[str, Any]:
 
 
 def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
-    """Returns the BSDF `nma` with the setting that makes it run its network at every shading point.
+    """Returns the BSDF `nma` with the setting that makes the BSDF run its network at every shading point.
 
-    In `scalar_rgb`, the setting is the option `online`. In the other variants, the network runs at every shading point
-    if a parameter has a texture, so a BSDF without a texture for sigma_t gets a constant texture.
+    In `scalar_rgb`, the setting is the option `online`. In Mitsuba's other variants, the network runs at every shading
+    point if any parameter has a texture. There a BSDF without a texture for sigma_t gets a constant texture.
     """
     import mitsuba as mi
 
@@ -102,13 +103,13 @@ def short(name: str) -> str:
 
 
 def unseen(count: int, seed: int = 92) -> list[Subject]:
-    """Draws materials from the paper's ranges; no adapter was trained on them."""
+    """Draws materials from the paper's ranges; no adapter was trained on these materials."""
     params = nma.LAYERED3.sample(np.random.default_rng(seed), count, "range")
     return [Subject(Material.of_vector(f"unseen-{n}", row, nma.LAYERED3)) for n, row in enumerate(params)]
 
 
 def worn_silver() -> Subject:
-    """Silver under worn, marbled lacquer. The roughness, the pigment and the amount of pigment come from textures."""
+    """Silver under worn, marbled lacquer. Roughness, colour and amount of pigment come from textures."""
     silver = nma.load_material("frosted-silver").changed({"alpha_top": 0.02, "eta_top": 1.5})
     return Subject(silver, procedural_textures(TEXELS), repeats=1.0)
 
@@ -167,7 +168,7 @@ def sphere(
 
 
 def environment(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
-    """The scene `sphere` without the sun: the sky alone has no bright spot."""
+    """The scene `sphere` without the sun, so that the sky has no bright spot."""
     return sphere(bsdf, size, rr_depth, hide_sun=True)
 
 
@@ -228,7 +229,7 @@ def _path(rr_depth: int) -> dict[str, Any]:
 
 
 def _light(towards: tuple[float, ...], distance: float, colour: tuple[float, ...]) -> dict[str, Any]:
-    """A small spherical light. Its radiance grows with distance^2, so all lights illuminate the ball equally."""
+    """A small spherical light. The radiance grows with distance^2, so all lights illuminate the ball equally."""
     direction = np.array(towards) / np.linalg.norm(towards)
     radiance = (LIGHT_POWER * distance**2 * np.array(colour)).tolist()
     return {

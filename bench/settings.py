@@ -4,16 +4,17 @@ python -m bench.settings [--variant scalar_rgb llvm_ad_rgb] [--scene preview lig
     [--size 192] [--spp 64] [--runs 4] [--reference-spp 1024] [--rr-depth 5] [--quick] [--output out/bench]
 
 Materials are untextured or textured. Untextured materials are drawn from the paper's ranges, and no adapter was trained
-on these materials; the adapters interpolate curves over the viewing angle. Textured materials are those of
-bench/scenes.py; the adapters run the network at every shading point. All results are ratios to `layered`, as geometric
-means over the materials. bench/frames.py defines variance, error and efficiency. The verdict names the BSDF with the
-higher efficiency by error, or "even" if the two efficiencies differ by less than 10 %. `doubt` is the relative standard
-error of the efficiency by error, estimated over the runs. `doubt` is large under sun and lamps, where a few bright
-pixels hold most of the noise. `principled` shows another material, so it has no error.
+on these materials. For untextured materials, the adapters interpolate curves over the viewing angle. Textured materials
+are those of bench/scenes.py; for textured materials, the adapters run the network at every shading point. All results
+are ratios to `layered`, as geometric means over the materials. bench/frames.py defines variance, error and efficiency.
+The verdict names the BSDF with the higher efficiency by error, or "even" if the two efficiencies differ by less than
+10 %. `doubt` is the relative standard error of the efficiency by error, estimated over the runs. `doubt` is large under
+sun and lamps, where a few bright pixels hold most of the noise. `principled` shows another material, so its error is
+not computed.
 
 Every run renders one frame with each BSDF. In a vectorised renderer, the measured time excludes the compilation of
-kernels. But the time includes the tracing of the BSDF in Python, about 0.05 s per frame for the larger network. In
-smaller frames than the default, tracing would therefore make the adapters look slower.
+kernels. But the measured time includes the tracing of the BSDF in Python, about 0.05 s per frame for the larger
+network. In frames smaller than the default size, tracing would therefore make the adapters look slower.
 
 Writes settings.json, settings.md (the table) and settings.png (efficiencies by error).
 """
@@ -129,7 +130,7 @@ def compare(
 def summary(
     place: dict[str, str], measured: list[dict[str, dict[str, float | None]]]
 ) -> list[dict[str, Any]]:
-    """Returns the table's rows for one setting: one row for each BSDF except the simulation."""
+    """Returns the table's rows for one renderer, scene and kind: one row for each BSDF except the simulation."""
     means = frames.mean_ratios(measured, scenes.SIMULATION)
     rows = []
     for name, figures in means.items():
@@ -141,7 +142,7 @@ def summary(
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draws a bar for the efficiency by error of every adapter in every setting, with one panel for each renderer."""
+    """Draws the adapters' efficiencies by error as bars, with one panel for each renderer."""
     renderers = list(dict.fromkeys(row["renderer"] for row in rows))
     names = [name for name in dict.fromkeys(row["BSDF"] for row in rows) if name != scenes.STAND_IN]
     figure = Figure(figsize=(9.5, 0.6 + 3.0 * len(renderers)), layout="constrained")

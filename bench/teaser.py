@@ -30,8 +30,8 @@ from nma.render.load import DEFAULT_ADAPTER
 
 ENLARGED = 4
 Figures = Mapping[str, Mapping[str, Any]]
-# The parts of the picture to enlarge. For each part: its name, and its upper left corner as fractions of width and
-# height.
+# The parts of the picture to enlarge: each part's name, and its upper left corner as fractions of the picture's width
+# and height.
 CROPS = {"Silver": (0.02, 0.30), "Copper": (0.36, 0.36), "Gold": (0.68, 0.36)}
 
 
@@ -77,7 +77,7 @@ def sheet(
     arguments: argparse.Namespace,
     path: Path,
 ) -> None:
-    """Writes a picture file with the pictures side by side, enlarged parts of the pictures, and a table."""
+    """Writes a sheet with the pictures side by side, enlarged parts of the pictures, and a table."""
     under = ["", *("{seconds:.2f} s, squared error {error:.2e}".format(**row) for row in rows.values())]
     lines = [Row("", pictures, under)]
     lines += [Row(name, [enlarge(picture, corner) for picture in pictures]) for name, corner in CROPS.items()]

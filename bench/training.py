@@ -1,4 +1,4 @@
-"""Training speed in bins per second, and the time of each stage of a training step, for our and the paper's recipe.
+"""Training speed in bins per second, and the time of each stage of a training step, with our and the paper's recipe.
 
 python -m bench.training [--steps 300]
 
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def measure(pool: Pool, name: str, network: str, steps: int) -> str:
-    """Trains with the preset `name` on a small pool, and returns one line of the table. Times are in ms per step."""
+    """Trains with the preset `name` on the bins of `pool`. Returns one line of the table, with times in ms per step."""
     recipe = preset(name, steps=steps, network=network)
     sampler = BinSampler(recipe.bins_law)
     began = time.perf_counter()
@@ -70,7 +70,7 @@ def seconds(recipe: Recipe, batches: list[Batch]) -> tuple[float, float]:
         batches.__getitem__,
         progress=lambda _: clock.append((time.perf_counter(), time.process_time())),
     )
-    # The time of the first group of steps contains compilation, so this group is not counted.
+    # The time of the first group of steps includes compilation, so this group is not counted.
     wall, cpu = (np.array(clock[-1]) - np.array(clock[0])) / (recipe.steps - loop.GROUP)
     return 1e3 * wall, 1e3 * cpu
 

@@ -1,4 +1,4 @@
-"""Walks per second and peak memory of the source `layered3`, for several numbers of materials from Table 1's ranges.
+"""Walks per second and peak memory of the source `layered3`, for several numbers of random materials.
 
 python -m bench.walks [--walks 819200] [--repeat 3]
 """
