@@ -310,7 +310,7 @@ def test_any_isotropic_material_is_written_by_a_command(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["brushed.xml"], "this one is anisotropic"),
+        (["brushed.xml"], "this source is anisotropic"),
         (["table.npz"], "holds tables.*nma fit table.npz"),
         (["none.npz"], "no such file"),
         (["class.safetensors"], "class: an adapter of the whole class layered3; name a material"),

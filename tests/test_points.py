@@ -155,7 +155,7 @@ def test_recipes_and_sources_must_agree_on_isotropy():
         NmaError, match="formula has values without noise, so the recipe's loss must be 'log'"
     ):
         fit(LAMBERT, replace(QUICK, loss="huber"))
-    with pytest.raises(NmaError, match="an anisotropic target needs anisotropic tables"):
+    with pytest.raises(NmaError, match="needs a grid with azimuths of wi"):
         replace(recipes.MEASURED, target="anisotropic")
 
 

@@ -321,7 +321,10 @@ def _arrays(tables, **changes):
         ({"params": np.array([None, {}], object)}, "not a reference file"),
         ({"class": np.array(["layered3"])}, "the entry `class` has type <U8 and shape"),
         ({"class": 3}, "the entry `class` has type int64"),
-        ({"class": "measured"}, "params have 13 columns, but class measured has 0; simulate it again"),
+        (
+            {"class": "measured"},
+            "params have 13 columns, but class measured has 0 columns; simulate the tables again",
+        ),
         ({"params": np.zeros((2, 5))}, "the class is not named, and no classes have 5 columns .*layered3 13"),
     ],
 )

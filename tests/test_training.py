@@ -212,7 +212,7 @@ def test_invalid_recipes_are_refused(change, message):
 
 def test_presets_are_found_by_name():
     assert preset("single", steps=None, seed=3) == replace(SINGLE, seed=3)
-    with pytest.raises(NmaError, match="unknown preset 'fast'; known are class, paper, single"):
+    with pytest.raises(NmaError, match="unknown preset 'fast'; known presets are class, paper, single"):
         preset("fast")
     with pytest.raises(NmaError, match="DEPTHxWIDTH"):
         training.initial_layers(Recipe(network="big"), LAYERED3)

@@ -34,9 +34,9 @@ _SHARP = 10.0
 class Evaluation:
     """The error figures of each material, and the mean of each figure over the materials.
 
-    The adapter's bin averages are numerical integrals. `integration_error` (in log loss) and `albedo_integration_error`
-    estimate the errors of these integrals, from two integrations with different points. `estimated_error` is true if
-    the reference tables have no standard errors, so that the errors were estimated from the number of walks.
+    `integration_error` (in log loss) and `albedo_integration_error` estimate the errors of the numerical integration
+    over bins, from two integrations with different points. `estimated_error` is true if the reference tables have no
+    standard errors, so that standard errors were estimated from the number of walks.
     """
 
     materials: list[dict[str, float]]
@@ -171,8 +171,8 @@ def evaluate(
     """Compares the adapter with reference tables on the paper's grid of bins.
 
     `progress` is called with the number of materials evaluated so far. Raises `TableError` if the tables have another
-    class or another grid, and `ParamError` for materials outside the adapter's training range. With `clamp`, the
-    parameters of such materials are moved to the end of the range instead.
+    class or another grid, and `ParamError` for materials outside the adapter's training range. With `clamp`, parameters
+    outside the training range are moved to the end of the range instead.
     """
     check_class(reference.class_name, adapter.space.name, "the adapter")
     if reference.values.shape[1:] != ISOTROPIC.shape:

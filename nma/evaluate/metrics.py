@@ -1,4 +1,4 @@
-"""Error figures of a material's table. They compare f cos(theta_o) [1/sr] and are means over bins and RGB.
+"""Error figures of one material's table. Each figure compares f cos(theta_o) [1/sr] and is a mean over bins and RGB.
 
 `a` is the adapter's table and `b` the reference, both (..., theta_i, theta_o, phi, 3).
 """
@@ -11,7 +11,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-# Added to the denominators of relative errors, so that they stay finite in dark bins [1/sr].
+# EPS [1/sr] is added to the denominators of relative errors, so that relative errors stay finite in dark bins.
 EPS = 1e-2
 
 
@@ -22,8 +22,8 @@ def _normal_means(n: int) -> NDArray[np.float64]:
     return -2.0 * n * np.diff(densities)
 
 
-# `noise_floor` takes these values and their negatives as samples of a standard normal variable. The mean of their
-# magnitudes equals the mean magnitude of the variable.
+# `noise_floor` takes these values and their negatives as samples of a standard normal variable. The mean magnitude of
+# these values equals that of a standard normal variable.
 _NORMAL = _normal_means(16)
 
 FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")

@@ -1,8 +1,8 @@
 """Compares two sources at random pairs of directions.
 
-cos(theta_i) and cos(theta_o) are independent and uniform in a range; azimuths are uniform. The comparison needs no
-bins, so the sources may be anisotropic, or models that were trained on different data. The error figures of adapters
-for single materials are computed in this way.
+cos(theta_i) and cos(theta_o) are independent and uniform in the range `cosines`; azimuths are uniform. The comparison
+needs no bins, so the sources may be anisotropic, or models that were trained on different data. The error figures of
+adapters for single materials are computed at random pairs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Pairs:
         return Pairs(mu_i, phi_i, mu_o, phi_o)
 
     def values(self, source: Values) -> NDArray[np.float64]:
-        """f cos(theta_o) [1/sr] of a source at these pairs of directions, (n, 3)."""
+        """f cos(theta_o) [1/sr] of a source at the pairs of directions, (n, 3)."""
         value = source.eval(direction(self.mu_i, self.phi_i), direction(self.mu_o, self.phi_o))
         return np.stack([np.broadcast_to(c.numpy(), len(self.mu_i)) for c in value], axis=-1).astype(
             np.float64

@@ -14,7 +14,8 @@ from nma.errors import NmaError, one_line
 from nma.files import whole, write_bytes
 from nma.images.size import MOST_PIXELS, header_size
 
-# The names of an image's channels, in the order in which a pixel stores them. The first three are the colour channels.
+# The names of an image's channels, in the order in which a pixel stores them. The first three channels are the colour
+# channels.
 CHANNELS = ("r", "g", "b", "a")
 COLOUR = CHANNELS[:3]
 
@@ -27,8 +28,8 @@ def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
     """Converts an image to float32, after a check that its shape is (height, width, 3) and that all values are finite.
 
     Raises:
-        ImageError: the shape is wrong, or values are NaN or infinite. The message has the number of such pixels and the
-            position of the first.
+        ImageError: the shape is wrong, or values are NaN or infinite. The error message has the number of NaN or
+            infinite pixels, and the position of the first.
     """
     array = np.asarray(image, dtype=np.float32)
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
@@ -47,8 +48,8 @@ def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -
 
     Let x = 2^exposure * radiance and s = `shoulder`. The function first compresses x: a value up to s stays as it is,
     and a larger value becomes s + (1 - s) (1 - exp(-(x - s) / (1 - s))), which has slope 1 at s and approaches 1. Then
-    it applies the sRGB transfer curve (IEC 61966-2-1). Each channel is converted by itself, so very bright colours
-    become white. With `shoulder` = 1, values above 1 are clipped, as error metrics require.
+    the function applies the sRGB transfer curve (IEC 61966-2-1). Each channel is converted by itself, so very bright
+    colours become white. With `shoulder` = 1, values above 1 are clipped, as error metrics require.
 
     Args:
         image: linear sRGB (..., 3); negative values become 0.
@@ -182,10 +183,7 @@ def read_image(path: str | Path) -> NDArray[np.float32]:
 
 
 def coloured_layer(bitmap: Any) -> Any:
-    """The bitmap's first RGB layer.
-
-    If there is none, its first grey or XYZ layer; if there is none either, the bitmap.
-    """
+    """The bitmap's first RGB layer, or its first grey or XYZ layer if no layer is RGB, or else the bitmap itself."""
     import mitsuba as mi
 
     kinds = mi.Bitmap.PixelFormat

@@ -1,4 +1,4 @@
-"""Measures the error of a rendered image against a reference. (`nma.images.sheet` makes contact sheets.)
+"""Measures the error of a rendered image against a reference.
 
 `a` is the test image and `b` the reference, both linear sRGB. Errors are means over pixels and channels, as fractions,
 not percent:

@@ -10,8 +10,8 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-# The most pixels that an image may have: 16384 x 8192, as in the largest common environment maps. They take 2 GiB as
-# RGBA in 32-bit floats.
+# The most pixels that an image may have: 16384 x 8192, as in the largest common environment maps. An image of this size
+# takes 2 GiB as RGBA in 32-bit floats.
 MOST_PIXELS = 1 << 27
 
 _START = 1 << 16  # bytes read at the start of a file, enough for every header
@@ -42,7 +42,8 @@ def header_size(path: str | Path) -> tuple[int, int] | None:
 def _numbers(kind: str, first: bytes, second: bytes) -> tuple[int, int]:
     if kind in (">i", "<i"):
         return abs(struct.unpack(kind, first)[0]), abs(struct.unpack(kind, second)[0])
-    # Python refuses to convert thousands of digits, so only the first 12 digits are read. They are enough for any size.
+    # Python refuses to convert thousands of digits, so only the first 12 digits are read, which are enough for any
+    # size.
     width, height = int(first[:12]), int(second[:12])
     return (width, height) if kind == "width height" else (height, width)
 
@@ -57,7 +58,7 @@ def _exr(start: bytes) -> tuple[int, int] | None:
 def _jpeg(file: BinaryIO) -> tuple[int, int] | None:
     """The size in a JPEG file's first frame header.
 
-    The segments before this header may have any length, so they are skipped.
+    The segments before the frame header may have any length, so the segments are skipped one by one.
     """
     file.seek(2)
     while len(head := file.read(4)) == 4 and head[0] == 0xFF:

@@ -280,7 +280,7 @@ def _uv_scale(given: Mapping[str, Any], default: float, where: str) -> float:
 
 
 def _option(given: Mapping[str, Any], key: str, default: float, where: str) -> float:
-    """The number given for the option `key`, which must be finite. If no number is given, the option's default."""
+    """The number given for the option `key`, which must be finite, or else the option's default."""
     value = given.get(key, default)
     if not (_is_number(value) and abs(_float(value)) < 1e38):
         raise MaterialError(f"{where}: {key} is {_shown(value)}, but must be a finite number")
@@ -320,7 +320,7 @@ def _refuse_unknown(given: Mapping[str, Any], known: tuple[str, ...], where: str
     for key in given:
         if key not in known:
             raise MaterialError(
-                f"{where}: unknown key {_shown(key)}{_suggestion(key, known)}; known are {', '.join(known)}"
+                f"{where}: unknown key {_shown(key)}{_suggestion(key, known)}; known keys are {', '.join(known)}"
             )
 
 

@@ -14,8 +14,7 @@ from nma.errors import TextureError, either, one_line
 from nma.images.io import CHANNELS, ImageError, coloured_layer, load_bitmap
 from nma.params import Param
 
-# Rounding may make the channels of a grey pixel differ by this much. For pixel values above 1 the limit is relative to
-# the value.
+# Rounding may make the channels of a grey pixel differ by this much, or by this fraction of a pixel value above 1.
 _GREY = 1e-6
 
 

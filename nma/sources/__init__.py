@@ -31,8 +31,8 @@ FORMATS = {
 }
 
 
-# The parameters of classes that cannot be simulated, and of the classes of the shipped adapters. Shipped adapters must
-# load without Dr.Jit, so their parameters cannot come from a source, which imports Dr.Jit.
+# `_SPACES` has the parameters of classes that cannot be simulated, and of the classes of the shipped adapters. Shipped
+# adapters must load without Dr.Jit, so their parameters cannot come from a source, which imports Dr.Jit.
 _SPACES = {space.name: space for space in (LAYERED3, MEASURED, LIBRARY)}
 
 
@@ -58,7 +58,7 @@ def names() -> tuple[str, ...]:
 def get(name: str) -> Source:
     """The source that simulates the class `name`. Raises `ParamError` if there is no such class."""
     if name not in CLASSES:
-        raise ParamError(f"unknown class '{name}'; known are {', '.join(CLASSES)}")
+        raise ParamError(f"unknown class '{name}'; known classes are {', '.join(CLASSES)}")
     return _at(CLASSES[name])()
 
 

@@ -47,10 +47,11 @@ class Walk:
 class Source(Protocol):
     """A stochastic appearance model g(wi) -> (wo, throughput), paper eq. 8, simulated event by event.
 
-    A walk leaves the material in a direction wo, with a throughput. For any set of directions, count the throughput as
-    0 if wo is not in the set: its expected value is then the integral of f cos(theta_o) over the set. A model that can
-    only evaluate f may draw wo from a density p at the first event and return the throughput f cos(theta_o) / p.
-    Throughputs should hardly exceed 1, because tables sum them as 32-bit integers, which could overflow.
+    A walk leaves the material in a direction wo, with a throughput. For any set of directions, the integral of f
+    cos(theta_o) over the set is the expected throughput, where a walk that leaves outside the set counts as throughput
+    0. A model that can only evaluate f may draw wo from a density p at the first event and return the throughput f
+    cos(theta_o) / p. Throughputs should hardly exceed 1, because tables sum them as 32-bit integers, which could
+    overflow.
     """
 
     space: ParamSpace
@@ -72,7 +73,7 @@ class Values(Protocol):
 
     `name` is the model's name in messages. `isotropic` is true if the value stays the same when both directions are
     rotated about the normal by the same angle. An isotropic model may still have different values for a pair of
-    directions and for the mirror image of the pair. The folded bins of a table hold the mean of these two values.
+    directions and for the mirror image of the pair; a folded bin of a table holds the mean of the two values.
     """
 
     @property
@@ -84,11 +85,12 @@ class Values(Protocol):
     def eval(self, wi: Vec3, wo: Vec3) -> Color:
         """f(wi, wo) cos(theta_o) [1/sr] for one pair of unit directions per Dr.Jit lane.
 
-        It is 0 if a direction is below the horizon. The colour is linear sRGB without bounds: a measured colour outside
-        the gamut has a negative channel.
+        The value is 0 if a direction is below the horizon. The colour is linear sRGB without bounds: a measured colour
+        outside the gamut has a negative channel.
 
-        Lanes are float32. Their type may be a differentiable type of Dr.Jit, but `eval` does not propagate derivatives.
-        Dr.Jit may trace the call into a kernel, so `eval` must not read the values of lanes or branch on them.
+        Lanes are float32. The type of the lanes may be a differentiable type of Dr.Jit, but `eval` does not propagate
+        derivatives. Dr.Jit may trace the call into a kernel, so `eval` must not read the values of lanes or branch on
+        them.
         """
         ...
 

@@ -40,8 +40,9 @@ class Finding:
 def check(path: str | Path) -> Iterator[Finding]:
     """Checks one file, or all files of measurements in a folder and its subfolders. Yields a `Finding` for each file.
 
-    The check compares the file's size and checksum with those of the original file, if they are known. It also reads
-    the file, to test whether its structure and its values are valid. Raises `SourceError` if there is no file to check.
+    The check compares the file's size and checksum with those of the original file, if they are known. The check also
+    reads the file, to test whether its structure and its values are valid. Raises `SourceError` if there is no file to
+    check.
     """
     path = Path(path)
     if not os.path.exists(path):

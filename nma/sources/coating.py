@@ -1,10 +1,10 @@
 """A rough metal under a clear or tinted coat, in closed form: the analytic coating model of production renderers.
 
-The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". It is the sum of two microfacet
-reflections: the coat's reflection and the metal's reflection. The metal's reflection is evaluated for the directions
-refracted at the mean surface. It is multiplied by two transmittances for each of the two directions: the Fresnel
-transmittance of the coat's surface, and the transmittance of the absorbing coat. Light that bounces between coat and
-metal is left out, so the model is darker than a simulation of the stack.
+The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". The model is the sum of two
+microfacet reflections: the coat's reflection and the metal's reflection. The metal's reflection is evaluated for the
+directions refracted at the mean surface. The metal's reflection is multiplied by two transmittances for each of the two
+directions: the Fresnel transmittance of the coat's surface, and the transmittance of the absorbing coat. Light that
+bounces between coat and metal is left out, so the model is darker than a simulation of the stack.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Coating:
     """The coating model (`Values`): a coat of refractive index `eta` (above 1) over the metal `conductor`.
 
     `alpha` and `alpha_metal` are the GGX widths of coat and metal, 1e-4 .. 1. `absorption` is the coat's optical depth
-    at normal incidence, per channel, at least 0. Raises `ParamError` for other numbers, and for a metal that is not
-    among those of `nma.conductors`.
+    at normal incidence, per channel, at least 0. Raises `ParamError` for a number outside its range, and for a metal
+    that `nma.conductors` does not have.
     """
 
     conductor: str = "Au"
@@ -67,7 +67,7 @@ class Coating:
         path = 1.0 / inside_i.z + 1.0 / inside_o.z
         # Where light leaves the coat, refraction multiplies the solid angle of a beam by eta^2 cos(inside) /
         # cos(outside), where inside and outside are the angles to the normal. So the metal's reflection is divided by
-        # this factor.
+        # eta^2 cos(inside) / cos(outside).
         through = (1.0 - loss_i) * (1.0 - loss_o) * o.z / (self.eta * self.eta * inside_o.z)
         dimmed = Color(
             *(c * through * ops.exp(-a * path) for c, a in zip(metal, self.absorption, strict=True))

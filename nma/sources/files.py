@@ -29,14 +29,14 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Format:
-    """A format of files that store BRDF values of materials. Its functions raise `SourceError` for a damaged file.
+    """A format of files that store BRDF values of materials.
 
-    `read(path)` returns the values (`Values`) of the material in a file. If a file holds several materials,
-    `names(path)` lists their names, and `read(path, name)` returns the values of the material `name`. `measurements`
-    are the published measurements that have this format. `identify(path)` reads the whole file and returns the name of
-    the measurements that the file belongs to. If the file is damaged, messages use the format's `name` instead.
-    `claims(path)` tells whether a file with the format's extension does have this format, since other formats may have
-    the same extension.
+    A format's functions raise `SourceError` for a damaged file. `read(path)` returns the values (`Values`) of the
+    material in a file. If a file holds several materials, `names(path)` lists their names, and `read(path, name)`
+    returns the values of the material `name`. `measurements` are the published measurements that have this format.
+    `identify(path)` reads the whole file and returns the name of the measurements that the file belongs to. For a
+    damaged file, messages use the format's `name` instead of the name of its measurements. `claims(path)` tells whether
+    a file with the format's extension does have this format, since other formats may have the same extension.
     """
 
     name: str

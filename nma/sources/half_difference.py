@@ -15,8 +15,8 @@ from nma.ops import Float, Vec3
 def half_difference(light: Vec3, view: Vec3) -> tuple[Vec3, Vec3]:
     """Returns (half vector rotated to azimuth 0, difference vector), both of unit length.
 
-    `light` and `view` are unit directions above the surface. For other directions the result is finite, but has no
-    meaning.
+    `light` and `view` are unit directions above the surface. For a direction below the surface the result is finite,
+    but has no meaning.
     """
     h = light + view
     h = h * (1.0 / ops.maximum(ops.sqrt(ops.dot(h, h)), 1e-12))
@@ -32,7 +32,7 @@ def half_difference(light: Vec3, view: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def angles(light: Vec3, view: Vec3) -> tuple[Float, Float, Float]:
-    """The angles (theta_h, theta_d, phi_d) [rad]. Their ranges are 0 .. pi/2, 0 .. pi/2 and -pi .. pi."""
+    """The angles (theta_h, theta_d, phi_d) [rad], in the ranges 0 .. pi/2, 0 .. pi/2 and -pi .. pi."""
     h, d = half_difference(light, view)
     sin_d = ops.safe_sqrt(d.x * d.x + d.y * d.y)
     return ops.atan2(h.x, h.z), ops.atan2(sin_d, d.z), ops.atan2(d.y, d.x)

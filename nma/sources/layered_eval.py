@@ -3,14 +3,14 @@
 Random walks estimate the light that leaves in a set of directions. A renderer also needs the value at a single pair
 (wi, wo), which this module estimates. The light from wi to wo is split into three kinds:
 
-- Light that the coat's upper side reflects. This light has a closed form.
+- Light that the coat's upper side reflects, for which there is a closed form.
 - Light that enters the coat and meets interfaces only.
 - Light that enters the coat and scatters in the medium at least once.
 
 For the last two kinds, a walk from wi is connected with a walk from wo, so that the estimate never depends on two
 narrow lobes that meet by chance (compare Guo, Hasan and Zhao 2018, section 5). Densities and throughputs are those of
-particles, as in the random walk of `nma.sources.layered`. Unlike radiance, they do not change by the squared index of
-refraction when a walk enters the coat.
+particles, as in the random walk of `nma.sources.layered`. Unlike radiance, densities of particles do not change by the
+squared index of refraction when a walk enters the coat.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LEAST_DIFFUSE = 0.03
 
 
 def settle(stack: Stack) -> Stack:
-    """Sets the coat's index to exactly 1 if it is almost 1. `evaluate` and `pdf` need a stack in this form."""
+    """Sets the coat's index to exactly 1 if it is almost 1, as `evaluate` and `pdf` require."""
     return replace(stack, eta_top=dr.select(stack.eta_top < 1.0 + INDEX_MATCHED, 1.0, stack.eta_top))
 
 
@@ -132,14 +132,14 @@ def _unscattered(
     """Light from wi to wo that meets interfaces only, and one segment of the walk `there`, chosen by `_Detour`.
 
     A path enters through the coat, hits the conductor once or more, and leaves through the coat. The path is sampled
-    from both ends, wi and wo. All its events are drawn at random except one, the connection, at which the two ends are
-    joined and whose density is evaluated. The best connection is the event with the widest lobe.
+    from both ends, wi and wo. All events of the path are drawn at random except one, the connection, at which the two
+    ends are joined and whose density is evaluated. The best connection is the event with the widest lobe.
 
-    A walk from wi can be connected at two events. At the exit, the density of being refracted out along wo is
-    evaluated. At the last hit of the conductor, the exit is drawn from wo, as the walk `back`. A walk from wo can be
-    connected at the entrance or at the first hit. A path with a single hit thus has three possible connections:
-    entrance, hit and exit. The balance heuristic (Veach 1997, eq. 9.8) gives each connection a weight proportional to
-    its bluntness, which is the reciprocal of the event's density.
+    A walk from wi can be connected at two events. If the connection is the exit, the density of being refracted out
+    along wo is evaluated. If the connection is the last hit of the conductor, the exit is drawn from wo, as the walk
+    `back`. A walk from wo can be connected at the entrance or at the first hit. A path with a single hit thus has three
+    possible connections: entrance, hit and exit. The balance heuristic (Veach 1997, eq. 9.8) gives each connection a
+    weight proportional to its bluntness, which is the reciprocal of the event's density.
     """
     source, clear = Layered3(), replace(stack, sigma_t=stack.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
@@ -154,7 +154,8 @@ def _unscattered(
         """
         w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
         rest = way_in + first
-        # Connect at the last hit. Under an index-matched coat, which reflects no light, this is the only connection.
+        # Connect at the last hit. Under an index-matched coat, which reflects no light, the last hit is the only
+        # connection.
         q, t = drawn_out
         blunt = _bluntness(_sharpness(stack, w_in, drawn_up))
         share = ops.select(matched, 1.0, blunt / (blunt + rest + _bluntness(q)))
@@ -293,8 +294,8 @@ def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
 def pdf(stack: Stack, wi: Vec3, wo: Vec3) -> Float:
     """A density of wo [1/sr] for importance sampling.
 
-    The density is similar to that of the random walk. It serves importance sampling and the weights of multiple
-    importance sampling. It is positive for wo.z > 0, and its integral is at most 1.
+    The density is similar to that of the random walk, and also gives the weights of multiple importance sampling. The
+    density is positive for wo.z > 0, and its integral is at most 1.
     """
     (coat, bottom, diffuse), width = lobes(stack, wi)
     inside_i, inside_o = refract_flat(wi, stack.eta_top), refract_flat(wo, stack.eta_top)
@@ -314,8 +315,8 @@ def sample(stack: Stack, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> Vec3:
     view = ops.select(on_coat, _above(wi), refract_flat(wi, eta))
     alpha = ops.select(on_coat, stack.alpha_top, width)
     mirrored = reflect(view, sample_visible_normal(view, alpha, alpha, u1, u2))
-    # The direction is refracted out through a flat coat. If it is totally reflected inside the coat, the sample is
-    # invalid.
+    # The direction is refracted out through a flat coat. A direction that is totally reflected inside the coat makes
+    # the sample invalid.
     cos2 = 1.0 - eta * eta * (1.0 - mirrored.z * mirrored.z)
     leaves = (mirrored.z > 0) & (cos2 > 0)
     seen = Vec3(mirrored.x * eta, mirrored.y * eta, ops.select(leaves, ops.safe_sqrt(cos2), -1.0))

@@ -90,7 +90,9 @@ class Merl:
         therefore reciprocal, even if the source is not. Raises `SourceError` for anisotropic sources.
         """
         if not values.isotropic:
-            raise SourceError(f"{values.name}: MERL files hold isotropic materials, this one is anisotropic")
+            raise SourceError(
+                f"{values.name}: MERL files hold isotropic materials, but this source is anisotropic"
+            )
         middles = [(np.arange(n) + 0.5) / n for n in SHAPE]
         grid = np.meshgrid(*middles, indexing="ij")
         h, d, p = (dr.auto.Float(x.ravel().astype(np.float32)) for x in grid)

@@ -65,7 +65,8 @@ class MitsubaBsdf:
         mi: Any = mitsuba
         if mi.variant() != self._variant:
             raise ParamError(
-                f"{self.name} was made in {self._variant}, but Mitsuba's variant is now {mi.variant()}; make it again"
+                f"{self.name} was made in {self._variant}, but Mitsuba's variant is now {mi.variant()}; "
+                "make the source again"
             )
         with dr.suspend_grad():
             active = mi.Bool((wi.z > 0) & (wo.z > 0))

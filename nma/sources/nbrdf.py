@@ -1,6 +1,6 @@
 """Neural BRDFs: one small network per material that maps a pair of directions to the BRDF's value.
 
-The networks are those of Sztrajman et al. 2021, "Neural BRDF Representation and Importance Sampling". They are
+The networks are those of Sztrajman et al. 2021, "Neural BRDF Representation and Importance Sampling". The networks are
 reconstructions, not measurements. We call the networks fitted to MERL's materials NBRDF-MERL, and the networks fitted
 to RGL's materials NBRDF-RGL.
 
@@ -41,7 +41,7 @@ class Nbrdf:
     isotropic = True
 
     def __init__(self, weights: NDArray, name: str = "NBRDF"):
-        """`weights` (675,) are in the order of the file. Raises `SourceError` if they have another shape."""
+        """`weights` (675,) are in the order of the file. Raises `SourceError` for weights of another shape."""
         if weights.shape != (WEIGHTS,):
             raise SourceError(f"{name}: an NBRDF network has {WEIGHTS} weights, got {weights.shape}")
         self.name = name

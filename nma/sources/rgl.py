@@ -1,10 +1,11 @@
-"""The `.bsdf` files of RGL's material database. This module reads and checks them; Mitsuba's `measured` evaluates them.
+"""The `.bsdf` files of RGL's material database.
 
-The database is that of Dupuy and Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and
-Rendering". A file has a header and a set of named arrays, called fields. The header has a magic string, the version and
-the number of fields. For each field the header has the name, rank, type, offset and shape. Mitsuba maps the file into
-memory without comparing the offsets with the file's size, so Mitsuba would read past the end of a truncated file. For
-this reason, this module checks a file before Mitsuba reads the file.
+This module reads and checks such files; Mitsuba's `measured` evaluates them. The database is that of Dupuy and Jakob
+2018, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering". A file has a header and a set of
+named arrays, called fields. The header has a magic string, the version and the number of fields. For each field the
+header has the name, rank, type, offset and shape. Mitsuba maps the file into memory without comparing the offsets with
+the file's size, so Mitsuba would read past the end of a truncated file. For this reason, this module checks a file
+before Mitsuba reads the file.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from nma.sources import files
 from nma.sources.files import Measurements
 
 _MAGIC = b"tensor_file\0"
-# NumPy types by their code in the file. Files of materials use no other codes.
+# NumPy types by their code in the file, for all codes that occur in files of materials.
 _TYPES = {
     1: "<u1",
     2: "<i1",

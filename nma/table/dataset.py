@@ -31,7 +31,7 @@ from nma.table.walks import stream_keys, tabulate
 FORMAT = 1
 # The materials that are simulated at once are called a block. A block has at most `_BLOCK` materials, and at most
 # `_BLOCK_WALKS` walks unless a single material needs more. An interrupted run loses only the walks of the current
-# block. Both limits leave the result unchanged.
+# block. `_BLOCK` and `_BLOCK_WALKS` do not change the result.
 _BLOCK = 16
 _BLOCK_WALKS = 1 << 27
 
@@ -59,7 +59,7 @@ class Settings:
         if self.population not in get_args(Population) or self.population == "unseen_metals":
             known = ", ".join(p for p in get_args(Population) if p != "unseen_metals")
             # "unseen_metals" takes every third material of one call of `ParamSpace.sample` from the held-out metals. A
-            # dataset draws each material in a call of its own, so this population is not possible.
+            # dataset draws each material in a call of its own, so a dataset cannot have this population.
             raise DatasetError(f"a dataset's population is one of {known}; got '{self.population}'")
 
 
@@ -80,7 +80,7 @@ def _fingerprint(settings: Settings) -> str:
 
 
 def simulate_block(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> Tables:
-    """The tables of the materials with these indices, without standard errors."""
+    """The tables of the materials with the given indices, without standard errors."""
     source = sources.get(settings.class_name)
     return tabulate(
         source,
@@ -181,7 +181,7 @@ class Dataset:
             ) from None
 
     def load(self, indices: NDArray[np.integer] | range | None = None) -> Tables:
-        """The tables (float16) of the materials with these indices, or of all materials.
+        """The tables (float16) of the materials with the given indices, or of all materials.
 
         Raises `DatasetError` if a chunk is missing or damaged.
         """

@@ -1,9 +1,9 @@
 """BSDF tables whose bins have equal solid angles: their grid and their files.
 
-Isotropic tables have shape (n, theta_i, theta_o, phi, 3). Their bins are uniform in cos(theta_i), in cos(theta_o) and
-in the azimuth between wi and wo. Index 0 of the two cosines is at grazing angles. The azimuth is folded to [0, pi], so
-the mirror direction is in the last bin. Anisotropic tables have shape (n, theta_i, phi_i, theta_o, phi_o, 3), with
-azimuths over [0, 2 pi). The value of a bin is the mean of f cos(theta_o) over the bin [1/sr].
+Isotropic tables have shape (n, theta_i, theta_o, phi, 3). The bins of isotropic tables are uniform in cos(theta_i), in
+cos(theta_o) and in the azimuth between wi and wo. Index 0 of either cosine is at grazing angles. The azimuth is folded
+to [0, pi], so the mirror direction is in the last bin. Anisotropic tables have shape (n, theta_i, phi_i, theta_o,
+phi_o, 3), with azimuths over [0, 2 pi). The value of a bin is the mean of f cos(theta_o) over the bin [1/sr].
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Grid:
 
     @property
     def solid_angle(self) -> float:
-        """The solid angle of a bin of wo [sr]. For a folded bin it includes both mirror halves."""
+        """The solid angle [sr] of a bin of wo, including both mirror halves if the bin is folded."""
         return 2.0 * math.pi / (self.theta_o * self.phi_o)
 
     def walks(self, wanted: int) -> int:
@@ -72,8 +72,8 @@ class Tables:
 
     `params` (n, columns) are the parameters of the materials, and `values` (n, *grid.shape) are their tables. `walks`
     (n,) has the number of random walks of each material. `error` has the standard error of each value, or is None.
-    `class_name` is the class of all materials. If it is not given, it is the only class whose parameters have as many
-    columns as `params`. Raises `TableError` if there is no such class, or more than one.
+    `class_name` is the class of all materials. If `class_name` is not given, it is the only class whose parameters have
+    as many columns as `params`. Raises `TableError` if no class, or more than one class, has as many columns.
     """
 
     params: NDArray[np.float64]
@@ -105,7 +105,7 @@ class Tables:
     def concatenate(parts: Sequence[Tables]) -> Tables:
         """Joins tables of several materials.
 
-        Raises `TableError` if their classes differ, or if only some of the tables have standard errors.
+        Raises `TableError` if the tables are of different classes, or if only some of the tables have standard errors.
         """
         classes = sorted({t.class_name for t in parts})
         if len(classes) > 1:
@@ -125,11 +125,11 @@ class Tables:
 
     @property
     def space(self) -> ParamSpace:
-        """The parameters of the class. Raises `TableError` if this version has no such class."""
+        """The parameters of the materials' class. Raises `TableError` if this version has no such class."""
         try:
             return sources.space(self.class_name)
         except ParamError as e:
-            raise TableError(f"{e}; the version that made the tables has it") from None
+            raise TableError(f"{e}; use the version that made the tables") from None
 
     def save(self, path: str | Path) -> None:
         """Writes a reference file (its format is in CONVENTIONS.md), atomically."""
@@ -163,8 +163,8 @@ class Tables:
             tables = Tables(params.astype(np.float64), values, walks, error, class_name)
             if class_name in sources.classes() and tables.space.size != params.shape[1]:
                 raise TableError(
-                    f"params have {params.shape[1]} columns, but class {class_name} has {tables.space.size}; "
-                    "simulate it again"
+                    f"params have {params.shape[1]} columns, but class {class_name} has {tables.space.size} columns; "
+                    "simulate the tables again"
                 )
         except TableError as e:
             raise TableError(f"{path}: {e}") from None
@@ -185,9 +185,9 @@ def check_class(found: str, wanted: str, reader: str, where: str = "") -> None:
 
 
 def class_entry(arrays: Any) -> str:
-    """The class that an .npz file names for its `params`; empty if it names none. Raises `ValueError` for a bad entry.
+    """The class that an .npz file names for its `params`, or "" if the file names no class.
 
-    Files of earlier versions name no class.
+    Files of earlier versions name no class. Raises `ValueError` if the entry `class` is not a name.
     """
     if "class" not in arrays:
         return ""
@@ -200,7 +200,10 @@ def class_entry(arrays: Any) -> str:
 
 
 def _class_with(columns: int) -> str:
-    """The only class whose parameter vectors have so many columns. Raises `TableError` if there is not exactly one."""
+    """The class whose parameter vectors have `columns` columns.
+
+    Raises `TableError` if not exactly one class has as many.
+    """
     sizes = {name: sources.space(name).size for name in sources.classes()}
     fitting = [name for name, size in sizes.items() if size == columns]
     if len(fitting) == 1:
@@ -214,7 +217,7 @@ def _class_with(columns: int) -> str:
 
 
 def kept(path: Path, make: Callable[[], Tables], params: NDArray[np.float64] | None = None) -> Tables:
-    """Loads tables from the file `path`. If there is no such file, makes the tables with `make` and saves them there.
+    """Loads tables from the file `path`. If there is no such file, makes the tables with `make` and saves them.
 
     The tables are made again if the file is damaged, or if `params` are given and differ from the parameters in the
     file.

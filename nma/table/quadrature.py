@@ -17,8 +17,8 @@ from nma.ops import Float, Vec3
 from nma.table.grid import ISOTROPIC, Grid
 
 # The density of points increases towards the mirror direction, down to the scale of a lobe of this microfacet width
-# (alpha). This is half the width of the narrowest lobe, because with coarser points training makes such lobes too
-# broad.
+# (alpha). The width is half that of the narrowest lobe, because with coarser points training makes the narrowest lobes
+# too broad.
 FINEST = 0.0005
 
 
@@ -49,8 +49,8 @@ def points(
     """Maps the point `u` of the unit cube to a pair of directions in the bin `place`.
 
     `place` is the bin's indices (theta_i, phi_i, theta_o, phi_o), as floats. For an isotropic grid, `u` has three
-    numbers and phi_i is ignored; for an anisotropic grid, `u` has four. The density of points increases towards the
-    mirror direction, down to the scale of a lobe of width `finest`. If `finest` is None, the density is uniform.
+    numbers and phi_i is ignored; for an anisotropic grid, `u` has four numbers. The density of points increases towards
+    the mirror direction, down to the scale of a lobe of width `finest`. If `finest` is None, the density is uniform.
     """
     i, a, o, b = place
     if grid.phi_i:
@@ -126,7 +126,7 @@ def _cosines(i: Float, o: Float, u: Float, v: Float, grid: Grid, scale: Float) -
 def _pair(
     u: Float, v: Float, x: tuple[Float, float], y: tuple[Float, float], centre: Float, scale: Float
 ) -> tuple[Float, Float, Float]:
-    """Draws a number from the bin `x` and a number from the bin `y`, with a higher density where they differ less.
+    """Draws a number from the bin `x` and a number from the bin `y`, more densely where these two numbers differ less.
 
     Returns (number in `x`, number in `y` minus number in `x`, weight). A bin is given as (lower end, width). `centre`
     is the middle of `y` minus the middle of `x`.
@@ -138,7 +138,7 @@ def _pair(
     # function of s, `room` has the shape of a triangle, or of a trapezoid if the widths of the bins differ.
     room = ops.minimum(reach - ops.absolute(s - centre), min(width_x, width_y))
     room = ops.maximum(room, 1e-7 * width_x)
-    # Draw the number in `x` uniformly from that interval.
+    # Draw the number in `x` uniformly from the interval of length `room`.
     low = ops.maximum(low_x, low_y - s)
     return low + v * room, s, room / (density * (width_x * width_y))
 

@@ -24,7 +24,8 @@ from nma.table import quadrature
 from nma.table.grid import ISOTROPIC, Grid, Tables
 
 # The default number of points per bin. Bins near the mirror direction get `_NEAR` times as many points, with a density
-# that increases towards the mirror direction. Such bins are few, and they contain the peaks of smooth materials.
+# that increases towards the mirror direction. Bins near the mirror direction are few, and they contain the peaks of
+# smooth materials.
 POINTS = 128
 _NEAR = 32
 # A bin counts as near if its theta_o is less than this many bins from the mirror direction.
@@ -35,14 +36,14 @@ _SETS = 4
 # The number of points must be a multiple of this. Then all sets have equally many points, and the points of each set
 # form equally many pairs in both mirror halves of a bin.
 _MULTIPLE = 16
-# Points stay this fraction of a bin's width away from its edges, so that rounding moves none into the next bin.
+# Points stay this fraction of a bin's width away from its edges, so that rounding moves no point into the next bin.
 _EDGE = 1e-5
 
 # If the variance of the weights is smaller than this, the weights count as equal, because only rounding makes them
 # differ.
 _UNWEIGHTED = 1e-4
 
-# The most bins in one kernel launch. This number limits the memory and does not change the result.
+# The most bins in one kernel launch, which limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 20
 
 # The number of walks (`walks`) of a table without any noise.
@@ -50,7 +51,7 @@ _NOISELESS = 1 << 40
 
 
 def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POINTS) -> Tables:
-    """The table of one source. Its `params` have the shape (1, 0).
+    """The table of one source. The table's `params` have the shape (1, 0).
 
     A bin's value is the mean over `points` points (a multiple of 16), evenly spread in the bin. Bins near the mirror
     direction have 32 times as many points, with a density that increases towards the mirror direction, down to the
@@ -86,8 +87,8 @@ def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
     """Marks the bins whose wo may be close to the mirror direction of their wi."""
     i, a, o, b = _indices(bins, grid)
     near_o = _apart(i, grid.theta_i, o, grid.theta_o) < _REACH
-    # If both directions are close to the normal, the half vector is close to it, too, whatever the azimuths are. So
-    # these bins count as near the mirror direction at every azimuth.
+    # If both directions are close to the normal, so is the half vector, whatever the azimuths are. So bins close to the
+    # normal count as near the mirror direction at every azimuth.
     top = (i == grid.theta_i - 1) & (o == grid.theta_o - 1)
     if not grid.phi_i:
         return near_o & (b >= grid.phi_o - 2) | top
@@ -159,7 +160,8 @@ def _moments(
         u = [dr.select((k & 1) == 0, x, 1.0 - x) * (1.0 - 2.0 * _EDGE) + _EDGE for x in u]
         wi, wo, w = quadrature.points(place, u, grid, quadrature.FINEST if crowded else None)
         if not grid.phi_i:
-            # A folded bin consists of two mirror halves. Every second pair of points goes to the second half.
+            # A folded bin consists of two mirror halves. Every second pair of points goes to the second mirror half of
+            # the bin.
             wo = Vec3(wo.x, dr.select((k & 2) == 0, wo.y, -wo.y), wo.z)
         value = values.eval(wi, wo) * w
         return k + 1, [s + x for s, x in zip(sums, (w, w * w, *value, *(value * w)), strict=True)]

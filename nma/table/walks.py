@@ -20,9 +20,9 @@ from nma.table.grid import ISOTROPIC, Grid, Tables
 # Throughputs are summed as integers in units of 2^-16, because an integer sum does not depend on the order of addition.
 _UNIT = 65536.0
 # The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1, so a quarter
-# is left for throughputs above 1.
+# of the counter's range is left for throughputs above 1.
 _WALKS_PER_ROW = 49151
-# The most bins of all materials in one kernel launch. This number limits the memory and does not change the result.
+# The most bins of all materials in one kernel launch, which limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 21
 
 

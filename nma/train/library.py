@@ -170,7 +170,7 @@ def _held(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Ar
 
 
 def _source(tables: Tables, recipe: Recipe) -> Callable[[int], Batch]:
-    """A function that returns the batch of a step. Its only column is the index of each row's material."""
+    """A function that returns the batch of a step. The batch's only column is the index of each row's material."""
     pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
     pool.params = np.arange(len(tables.values), dtype=np.float32)[:, None]
     return lambda step: draw(pool, sampler, recipe, step)

@@ -111,7 +111,7 @@ def train(
 
 
 def result(run: Run, recipe: Recipe) -> Weights:
-    """The trained weights as NumPy arrays. If the recipe's `average` is above 0, they are the averaged weights."""
+    """The trained weights as NumPy arrays, averaged over the last steps if the recipe's `average` is above 0."""
     return jax.tree.map(np.asarray, run.state.averaged if recipe.average > 0 else run.state.layers)
 
 
@@ -145,7 +145,7 @@ def _group(
 
 
 def _plateau(run: Run) -> float:
-    """The scale of the next steps. It is halved if the mean loss has not fallen by 1 % from one window to the next."""
+    """The scale of the next steps, halved if the mean loss has not fallen by 1 % from one window to the next."""
     window = _PATIENCE * GROUP
     if run.step % window or run.step < 2 * window:
         return run.scale

@@ -68,8 +68,8 @@ def _points(batch: Batch, recipe: Recipe) -> quadrature.Points:
 def albedos(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array:
     """Two independent unbiased estimates (2, 3, rows) of the target's directional albedo, from samples of its lobes.
 
-    Derivatives treat the sampled directions and their densities as constants. The derivatives are therefore unbiased,
-    too. Estimates are not clipped, because clipping would bias them.
+    Derivatives treat the sampled directions and their densities as constants, so the derivatives are unbiased, too.
+    Estimates are not clipped, because clipping would bias them.
     """
     lattice = jnp.asarray(lattice_points(recipe.albedo_samples), jnp.float32).T[:, None, :, None]
     u = (lattice + batch.albedo_shift[:, :, None]) % 1.0  # (3, 2, samples, rows)
@@ -102,7 +102,7 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
 
 
 def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The recipe's distance and the log loss, both between bin means (3, bins_per_row, rows) and the tables."""
+    """The distance that the recipe chooses, and the log loss, from bin means (3, bins_per_row, rows) to the tables."""
     residual = jnp.log1p(mean) - jnp.log1p(batch.value)
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":

@@ -34,7 +34,7 @@ ROWS, POINTS = 8192, 512
 _CROWDED = 4
 # Widths (alpha) of the microfacet lobes from which the directions near the mirror direction are drawn.
 _WIDTHS = tuple(0.0005 * 2.0**k for k in range(11))
-# Number of rows that are evaluated at once. It limits the memory.
+# Number of rows that are evaluated at once, which limits the memory.
 _ROWS_PER_LAUNCH = 2048
 
 
@@ -131,7 +131,7 @@ def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
     """Directions wo from uniform numbers, and their weights.
 
     wo is uniform over the hemisphere or, where `crowded` is 1, drawn near the mirror direction. The weight is the
-    density of uniform directions divided by the density of the mixture, and 0 below the horizon.
+    density of uniform directions divided by the density from which wo is drawn, and 0 below the horizon.
     """
     turn = (2.0 * math.pi) * u[0]
     across = ops.safe_sqrt(1.0 - u[1] * u[1])
@@ -148,7 +148,10 @@ def _directions(wi: Vec3, u: list[Any], crowded: Any) -> tuple[Vec3, Any]:
 
 
 def points_loss(layers: Any, batch: PointBatch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The loss to minimise, and the log loss of eq. 7 at the points. `nma.train.loop` takes it as `objective`."""
+    """The loss to minimise, and the log loss of eq. 7 at the points.
+
+    `nma.train.loop` takes this function as `objective`.
+    """
     brdf = brdf_of(layers, batch, recipe)
     value = jnp.stack(list(brdf.eval(view(batch), Vec3(*batch.wo))))
     log_loss = (jnp.abs(jnp.log1p(value) - jnp.log1p(batch.value)) * batch.weight).mean()

@@ -51,8 +51,8 @@ CONSTANT = Recipe(
     steps=800,
 )
 
-# Starting points of the fits. There are several, because the loss has many local minima. The base colour of each is
-# replaced by the mean albedo of the table.
+# Starting points of the fits. There are several starting points, because the loss has many local minima. The base
+# colour of each starting point is replaced by the mean albedo of the table.
 _GREY = Color(0.5, 0.5, 0.5)
 _STARTS = {
     "diffuse": Principled(_GREY, 0.6, 0.05, 0.5, 0.1, 0.1, 0.5, 0.05, 0.5, flatness=0.1),
@@ -150,7 +150,10 @@ def _judge(adapter: Adapter, tables: Tables) -> _Judged:
 
 
 def _starts(tables: Tables) -> NDArray[np.float32]:
-    """Encoded parameters (starts, outputs) of all starting points. Their base colour is the table's mean albedo."""
+    """Encoded parameters (starts, outputs) of all starting points.
+
+    The base colour of all starting points is the table's mean albedo.
+    """
     base_color = Color(*np.clip(tables.albedo()[0].mean(axis=0), 0.02, 0.98))
     blends = [Blend((p._replace(base_color=base_color),), (1.0,)) for p in _STARTS.values()]
     return np.array([target.encode(b, CONSTANT_PARAMS) for b in blends], np.float32)

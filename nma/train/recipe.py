@@ -1,4 +1,4 @@
-"""The settings of a training run. They are stored with the weights, so that the run can be repeated."""
+"""The settings of a training run. The settings are stored with the weights, so that the run can be repeated."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Recipe:
     - `loss`: "log" is eq. 7. "huber" is linear like eq. 7 for residuals beyond three standard errors of the table's
       bin, and quadratic for smaller residuals. The quadratic part makes the fit of a noisy bin approach the bin's mean,
       not its median.
-    - `energy`: weight of the error of the values themselves, which is added to the error of their logarithms. It makes
-      bright bins count more.
+    - `energy`: weight of the error of the values themselves, which is added to the error of their logarithms. The
+      larger `energy` is, the more bright bins count.
     - `albedo`: weight of the squared error of the directional albedo, which is estimated from two times
       `albedo_samples` samples per row.
     - `schedule`: how the learning rate changes. "onecycle" rises to `learning_rate` and falls again. "plateau" starts
@@ -176,7 +176,7 @@ PRESETS = {
 def preset(name: str, **changes) -> Recipe:
     """The preset `name` with `changes` to some settings; the value `None` leaves a setting unchanged."""
     if name not in PRESETS:
-        raise NmaError(f"unknown preset '{name}'; known are {', '.join(PRESETS)}")
+        raise NmaError(f"unknown preset '{name}'; known presets are {', '.join(PRESETS)}")
     return replace(PRESETS[name], **{k: v for k, v in changes.items() if v is not None})
 
 
