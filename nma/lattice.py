@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # For each dimension d, the root of x^(d+1) = x + 1.
-_ROOTS = {3: 1.2207440846057596, 4: 1.1673039782614187}
+_ROOTS = {2: 1.324717957244746, 3: 1.2207440846057596, 4: 1.1673039782614187}
 
 
 def lattice_steps(dimensions: int) -> tuple[float, ...]:
@@ -17,7 +17,7 @@ def lattice_steps(dimensions: int) -> tuple[float, ...]:
 
 
 def lattice_points(n: int, dimensions: int = 3) -> NDArray[np.float64]:
-    """The first `n` points of the lattice, (n, 3 or 4): 0.5 + k * lattice_steps for k = 0, 1, ..., modulo 1.
+    """The first `n` points of the lattice, (n, 2, 3 or 4): 0.5 + k * lattice_steps for k = 0, 1, ..., modulo 1.
 
     Quadratures shift the points by random numbers, modulo 1, which makes the estimates unbiased.
     """

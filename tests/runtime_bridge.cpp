@@ -67,6 +67,15 @@ void brdf_numbers(int n, int count, const nma_brdf* brdfs, float* out) {
     }
 }
 
+// Writes the scales of n BRDFs as RGB.
+void brdf_scales(int n, const nma_brdf* brdfs, float* out) {
+    for (int i = 0; i < n; ++i, out += 3) {
+        const nma::Vec3<float>& scale = reinterpret_cast<const nma::Brdf*>(brdfs + i)->blend().scale;
+        const float row[] = {scale.x, scale.y, scale.z};
+        std::copy_n(row, 3, out);
+    }
+}
+
 int brdf_size() { return sizeof(nma::Brdf); }
 int curve_nodes() { return nma::Curves::NODES; }
 float curve_min_cos() { return nma::Curves::MIN_COS; }

@@ -8,8 +8,11 @@ import numpy as np
 from target_cases import stacked
 
 from nma.native.runtime import available
+from nma.target import Principled
 
 HERE = Path(__file__).parent
+# The count of numbers of a Principled BRDF. Its colour is one field of three numbers.
+PRINCIPLED_SIZE = len(Principled._fields) + 2
 FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", f"-I{HERE.parent / 'runtime'}"]
 
 

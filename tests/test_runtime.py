@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from density_cases import p_values
-from runtime_cases import built, facing, in_single_precision, pointer, rows
+from runtime_cases import PRINCIPLED_SIZE, built, facing, in_single_precision, pointer, rows
 from target_cases import random_blend, random_directions, stacked
 
 import nma
@@ -17,8 +17,6 @@ from nma.ops import Vec3, at_azimuth_0
 from nma.params import MEASURED
 
 CASES = 4000
-# The count of numbers in the array of an instance. The colour is one field of `Principled`, but three numbers.
-PRINCIPLED_SIZE = len(target.Principled._fields) + 2
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

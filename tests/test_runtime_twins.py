@@ -10,18 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runtime_cases import built, in_single_precision, pointer, rows
+from runtime_cases import PRINCIPLED_SIZE, built, in_single_precision, pointer, rows
 from target_cases import horizon_pairs, random_directions
 
 import nma
 from nma import Runtime, sources
 from nma.adapter import encoding
 from nma.adapter.adapter import SAME
-from nma.native.runtime import _COMPACT, INSTRUCTION_SETS
-from nma.ops import Vec3
+from nma.lattice import lattice_steps
+from nma.native.runtime import _COMPACT, INSTRUCTION_SETS, available
+from nma.ops import Color, Vec3
 from nma.params import LAYERED3, LIBRARY, MEASURED
 from nma.render import curves
-from nma.target.decode import TARGETS, decode, output_size
+from nma.target import Blend, Principled
+from nma.target.decode import TARGETS, decode, encode, output_size
 
 ROOT = Path(__file__).parent.parent
 CASES = 4000
@@ -177,9 +179,79 @@ def test_curves_have_the_same_nodes(bridge):
     assert bridge.curve_min_cos() == np.float32(curves.MIN_COS)
 
 
+def test_curves_interpolate_every_number_between_two_nodes(bridge, tmp_path):
+    """A quarter of the way from one node to the next, all numbers and scales of the BRDF have changed by a quarter.
+
+    The adapter is bounded and reflects more light than it receives, so its scales vary.
+    """
+    params, rng = TARGETS["stretched"], np.random.default_rng(8)
+    bright = Principled(Color(0.98, 0.95, 0.9), 0.9, 0.05, 1.0, 0.1, 0.9, 0.1, 0.5, 0.5)
+    bias, last = np.array(encode(Blend((bright, bright), (0.6, 0.4)), params)), curves.NODES - 1
+    slope = 0.1 * rng.normal(size=(len(bias), 1))
+    path = saved(tmp_path, MEASURED, "direction", 2, True, params, slope, bias)
+    replace(nma.Adapter.load(path), bounded=True).save(path)
+    runtime, left = Runtime(path, "portable"), np.arange(1, last)
+    nothing = pointer(np.zeros(1, np.float32))
+    runtime._c.nma_curves_new.restype = ctypes.c_void_p
+    made = ctypes.c_void_p(runtime._c.nma_curves_new(runtime._handle, nothing))
+
+    def at(cosines):
+        brdfs = runtime.prepare(np.zeros((len(cosines), 0)), cosines)
+        for brdf, cosine in zip(brdfs, cosines, strict=True):
+            runtime._c.nma_curves_at(made, ctypes.c_float(cosine), pointer(brdf))
+        return numbers_of(brdfs)
+
+    def numbers_of(brdfs):
+        found = np.zeros((len(brdfs), 2 * (PRINCIPLED_SIZE + 1)), np.float32)
+        scales = np.zeros((len(brdfs), 3), np.float32)
+        bridge.brdf_numbers(len(brdfs), 2, pointer(brdfs), pointer(found))
+        bridge.brdf_scales(len(brdfs), pointer(brdfs), pointer(scales))
+        return np.column_stack([found, scales])
+
+    nodes = numbers_of(runtime.prepare(np.zeros((last - 1, 0)), left / last))
+    following = numbers_of(runtime.prepare(np.zeros((last - 1, 0)), (left + 1) / last))
+    assert (np.abs(following - nodes)[:, -3:] > 1e-3).any(axis=0).all()
+    quarter = at((left + 0.25) / last)
+    runtime._c.nma_curves_free(made)
+    np.testing.assert_allclose(quarter, nodes + 0.25 * (following - nodes), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("instruction_set", available())
+def test_weights_are_rounded_to_the_nearest_bfloat16_and_ties_to_even(tmp_path, instruction_set):
+    """Each output of the network in this test is one weight. bfloat16 has 7 bits after the leading one."""
+    step, size = 2.0**-7, output_size(2, TARGETS["principled"])
+    given = 1.0 + step * np.array([0.5, 1.5, 2.5, 3.5, 0.499, 0.501, 1.499, 1.501, 1.0])
+    wanted = 1.0 + step * np.array([0.0, 2.0, 2.0, 4.0, 0.0, 1.0, 1.0, 2.0, 1.0])
+    weights = np.resize(np.concatenate([given, -given, 2.0**-20 * given]), size)
+    path = saved(
+        tmp_path, MEASURED, "direction", 2, False, TARGETS["principled"], weights[:, None], np.zeros(size)
+    )
+    found = Runtime(path, instruction_set, compact=True).outputs(np.zeros((1, 0)), [0.5])[0]
+    expected = np.resize(np.concatenate([wanted, -wanted, 2.0**-20 * wanted]), size)
+    np.testing.assert_array_equal(found, expected.astype(np.float32))
+
+
+def test_the_albedo_is_the_mean_over_the_points_of_a_lattice():
+    """C++ has the steps of the lattice as numbers; Python computes them."""
+    points, runtime, rng = 128, Runtime("layered3-3x32"), np.random.default_rng(9)
+    params, wi = LAYERED3.sample(rng, 20), rows(random_directions(rng, 20)).astype(np.float32)
+    brdfs, n = runtime.prepare(params, wi), np.arange(points) + 0.5
+    u = np.column_stack([n / points, n[:, None] * np.array(lattice_steps(2)) % 1.0])
+    for brdf, view, albedo in zip(brdfs, wi, runtime.albedo(brdfs, wi), strict=True):
+        _, value, pdf = runtime.sample(np.tile(brdf, (points, 1)), np.tile(view, (points, 1)), u)
+        weights = value[pdf > 0] / pdf[pdf > 0, None]
+        np.testing.assert_allclose(albedo, np.minimum(weights.sum(axis=0) / points, 1.0), rtol=1e-4)
+
+
 def test_a_brdf_has_the_size_that_the_readme_says(bridge):
     readme = (ROOT / "runtime/README.md").read_text()
     assert bridge.brdf_size() == int(re.search(r"a plain value of (\d+) bytes", readme)[1])
+
+
+def test_a_brdf_for_c_is_hardly_larger_than_a_brdf(bridge):
+    """Rows of BRDFs waste at most 16 bytes each. The compiler checks that they are not too small."""
+    runtime = Runtime("layered3-3x32")
+    assert 0 <= runtime._c.nma_brdf_size() - bridge.brdf_size() <= 16
 
 
 def test_instruction_sets_have_the_values_of_the_c_header():
