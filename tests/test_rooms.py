@@ -4,6 +4,7 @@ The committed drawing shows all rooms and imports.
 """
 
 import re
+import sys
 
 import pytest
 
@@ -18,6 +19,12 @@ def test_every_import_goes_to_a_lower_floor():
     level = {room: number for number, floor in enumerate(rooms.floors()) for room in floor}
     assert not {(a, b) for a, b in rooms.imports() if level[a] >= level[b]}
     assert not rooms.circle(rooms.imports())
+
+
+def test_without_the_extra_dev_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "grimp", None)
+    with pytest.raises(SystemExit, match=r"^reading the imports .* needs grimp; .* pip install '\.\[dev\]'$"):
+        rooms.imports.__wrapped__()
 
 
 def test_rooms_and_floors_are_few_enough_to_remember():

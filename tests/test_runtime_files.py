@@ -200,6 +200,7 @@ def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
     """
     path, vector = tmp_path / "one.safetensors", LAYERED3.sample(np.random.default_rng(0), 1)[0]
     vector[12] = 3.0
+    vector = vector.astype(np.float32).astype(np.float64)
     adapter = random_adapter(hidden="1x8", name="direction")
     replace(adapter, training={"params": vector.tolist()}).save(path)
     runtime, mu = Runtime(path), np.float32([0.5])
@@ -209,9 +210,12 @@ def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
     other = own * np.where(np.arange(13) == 9, 1.001, 1)
     for clamp in (False, True):
         with pytest.raises(
-            ParamError, match="albedo of row 0 is .*, but the adapter was trained for a single material"
-        ):
-            runtime.prepare(other, mu, clamp=clamp)
+            ParamError, match="^row 1: .* trained for a single material, whose albedo is"
+        ) as told:
+            runtime.prepare(np.concatenate([own, other]), mu.repeat(2), clamp=clamp)
+        with pytest.raises(ParamError) as also_told:
+            replace(adapter, training={"params": vector.tolist()}).check(np.concatenate([own, other]))
+        assert str(told.value) == str(also_told.value)
     for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13):
         replace(adapter, training={"params": params}).save(path)
         with pytest.raises(WeightsError, match="the recorded material does not fit the class layered3"):

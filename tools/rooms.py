@@ -10,12 +10,11 @@ from __future__ import annotations
 import ast
 import itertools
 import re
+import sys
 import tomllib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-
-import grimp
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "nma"
@@ -35,6 +34,10 @@ def floors() -> tuple[tuple[str, ...], ...]:
 @cache
 def imports() -> frozenset[Arrow]:
     """All imports of one room by another room. `nma/__init__.py` does not count as a room."""
+    try:
+        import grimp
+    except ImportError:
+        sys.exit("reading the imports of the rooms needs grimp; in a checkout run: pip install '.[dev]'")
     graph = grimp.build_graph(PACKAGE, cache_dir=None)
     pairs = {
         (_room(module), _room(imported))

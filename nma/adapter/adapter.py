@@ -172,14 +172,8 @@ class Adapter:
                 params, "valid" if self.encoding in encoding.SINGLE else "training", clamp
             )
         given = self.space.check(params)
-        for name, columns in self.space.slices.items():
-            other = ~np.isclose(given[:, columns], known[columns], rtol=SAME).all(axis=1)
-            if other.any():
-                raise ParamError(
-                    f"the adapter was trained for a single material, {self.training.get('material', 'unnamed')}, whose "
-                    f"{name} is {_plain(known[columns])}, not {_plain(given[other][0, columns])}; fit another adapter "
-                    "to your material, or use an adapter of its class"
-                )
+        names = [param.name for param in self.space.params for _ in range(param.size)]
+        check_same(given, known, names, self.training.get("material", ""))
         return given
 
     def prepare(self, columns: Sequence[Float], wi: Vec3, active: Any = True) -> Brdf:
@@ -275,6 +269,24 @@ class Adapter:
             raise WeightsError(
                 f"{path}: its material does not fit the class {self.space.name} ({e}); fit it again"
             ) from None
+
+
+def check_same(given: NDArray, known: NDArray, names: Sequence[str], material: str = "") -> None:
+    """Raises `ParamError` if a row of `given` (n, columns) differs from the parameters `known` of a single material.
+
+    `names` has the name of each column's parameter, and `material` is the name of the single material.
+    """
+    other = ~np.isclose(given, known, rtol=SAME)
+    if not other.any():
+        return
+    row, column = np.argwhere(other)[0]
+    columns = [k for k, name in enumerate(names) if name == names[column]]
+    where = f"row {row}: " if len(given) > 1 else ""
+    raise ParamError(
+        f"{where}the adapter was trained for a single material, {material}{', ' if material else ''}whose "
+        f"{names[column]} is {_plain(known[columns])}, not {_plain(given[row, columns])}; fit another adapter "
+        "to your material, or use an adapter of its class"
+    )
 
 
 def _plain(numbers: NDArray) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nma.adapter import weights_file
-from nma.adapter.adapter import SAME
+from nma.adapter.adapter import check_same
 from nma.errors import ParamError, WeightsError
 from nma.native import build
 from nma.params import Bounds
@@ -159,14 +159,7 @@ class Runtime:
         was fitted to a single material, raises `ParamError` if a parameter differs from that material."""
         rows = _rows("params", params, self.parameters)
         if self.material is not None:
-            other = ~np.isclose(rows, self.material, rtol=SAME)
-            if other.any():
-                row, column = np.argwhere(other)[0]
-                raise ParamError(
-                    f"{self.names[column]} of row {row} is {rows[row, column]:g}, but the adapter was trained "
-                    f"for a single material, whose {self.names[column]} is {self.material[column]:g}; "
-                    "fit another adapter to the new material"
-                )
+            check_same(rows, self.material, self.names)
             return rows
         allowed = Bounds(self.low, self.high)
         bad = allowed.bad(rows, clamp)
