@@ -69,7 +69,7 @@ def reference(name: str, quick: bool) -> nma.Tables:
     words = [str(word) for option in options.items() for word in option]
     REFERENCES.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:
-        # Wait while another experiment simulates the same set.
+        # If another experiment simulates the same set, wait for its result.
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)
@@ -95,8 +95,8 @@ def figures(
 ) -> list[dict[str, float]]:
     """Returns the adapter's metrics for every material of the tables. The tables must have standard errors.
 
-    The adapter is integrated over the bins once. (`nma.evaluate_adapter` integrates twice, to measure the accuracy of
-    the integration.)
+    This function integrates the adapter over the bins once, while `nma.evaluate_adapter` integrates twice to measure
+    the accuracy of the integration.
 
     Args:
         directions: number of values of cos(theta_i) in each row of a table; None for the default of `tabulate_adapter`.

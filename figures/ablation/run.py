@@ -4,7 +4,7 @@
 
 Trains on a dataset of 8000 materials, which `nma dataset layered3 FOLDER --seed 1` makes. Evaluates on every third
 material of the sets "range" and "metals" (figures/common.py). The metrics of finished trainings are kept in
-out/figures/ablation, so a killed run does not repeat these trainings.
+out/figures/ablation, so a run that starts again after an interruption does not repeat these trainings.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def data(path: Path, quick: bool) -> nma.Tables:
 
 
 def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma.Tables], steps: int) -> dict:
-    """Trains with one change, and returns the metrics. Every training uses as many bins as the preset `class` uses in
-    `steps` steps."""
+    """Trains with one changed setting, and returns the metrics. Every training uses as many bins as the preset `class`
+    uses in `steps` steps."""
     change = dict(CHANGES[name])
     recipe = preset(change.pop("preset", "class"), **change)
     recipe = replace(recipe, steps=steps * preset("class").bins_per_step // recipe.bins_per_step)
@@ -95,7 +95,7 @@ def train(name: str, tables: Callable[[], nma.Tables], references: dict[str, nma
 
 
 def plot(results: dict, path: Path) -> None:
-    """Draws bars for the log loss and the albedo error of every change, for both sets of materials."""
+    """Draws bars for the log loss and the albedo error of every changed setting, for both sets of materials."""
     figure = Figure(figsize=(10, 1.2 + 0.35 * len(results)), layout="constrained")
     names, places = list(results), np.arange(len(results))
     for axes, quantity in zip(figure.subplots(1, 2, sharey=True), ("log_loss", "albedo_error"), strict=True):

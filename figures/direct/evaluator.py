@@ -1,9 +1,9 @@
 """A network that evaluates f cos(theta_o) directly: a latent code per material, and a decoder with a million weights.
 
-The latent size, and roughly the decoder size, are those of Fan et al. 2022, "Neural Layered BRDFs", as the NMA paper
-states them. The weights and data of Fan et al. are not available, so all other choices are our own. To make the
-comparison fair, the network's inputs are half-vector coordinates (Rusinkiewicz 1998), in which highlights have a simple
-shape. The network is trained with the adapter's data, loss and optimiser.
+The size of the latent code, and roughly the size of the decoder, are those that the NMA paper states for Fan et al.
+2022, "Neural Layered BRDFs". The weights and data of Fan et al. are not available, so all other choices are our own. To
+make the comparison fair, the network's inputs are half-vector coordinates (Rusinkiewicz 1998), in which highlights have
+a simple shape. The network is trained with the adapter's data, loss and optimiser.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ from nma.train.recipe import Recipe, preset
 
 LATENT = 32
 FEATURES = 6
-# The initial biases make the untrained network return about this value of log(1 + f cos(theta_o)).
+# The output layer's initial biases make the untrained network return values of log(1 + f cos(theta_o)) near _INITIAL.
 _INITIAL = 0.05
-# The inputs do not resolve half angles whose sines are far below this value.
+# The network's inputs hardly change for half angles whose sine is far below _SHARPEST.
 _SHARPEST = 1e-3
 
 
 class Evaluator(NamedTuple):
-    """Latent codes (materials, LATENT), and a decoder: from code and directions to log(1 + f cos(theta_o))."""
+    """Latent codes (materials, LATENT), and a decoder that computes log(1 + f cos(theta_o)) from a code and two
+    directions."""
 
     latents: Any
     decoder: Layers
@@ -58,7 +59,7 @@ def recipe(steps: int, network_name: str, seed: int = 0) -> Recipe:
 
 
 def start(materials: int, how: Recipe) -> Evaluator:
-    """Returns random latent codes and layers, from the recipe's seed."""
+    """Returns latent codes and a decoder with random values, drawn with the recipe's seed."""
     rng = np.random.default_rng((how.seed, 0xD1EC7))
     sizes = [LATENT + FEATURES, *network.hidden(how.network), 3]
     decoder = network.init(rng, sizes, np.full(3, np.log(np.expm1(_INITIAL))))
@@ -76,8 +77,8 @@ def evaluate(decoder: Layers, latent: Any, wi: Vec3, wo: Vec3) -> Any:
 def _features(wi: Vec3, wo: Vec3) -> list[Any]:
     """Returns the network's inputs, scaled to about -1 .. 1.
 
-    The inputs are the cosines of theta_i, theta_o, the half angle and the difference angle, the logarithm of the half
-    angle's sine, and the cosine of the azimuth between wi and wo.
+    The inputs are the cosines of four angles (theta_i, theta_o, the half angle, the difference angle), the logarithm of
+    the half angle's sine, and the cosine of the azimuth between wi and wo.
     """
     half = ops.normalize(wi + wo)
     sine = ops.safe_sqrt(half.x * half.x + half.y * half.y)
@@ -96,7 +97,7 @@ def train(
     progress: Callable[[loop.Run], None],
     decoder: Layers | None = None,
 ) -> tuple[Evaluator, loop.Run]:
-    """Trains latent codes for the tables' materials, and continues from the checkpoint if its file exists.
+    """Trains latent codes for the tables' materials, and continues from the checkpoint if the checkpoint's file exists.
 
     Args:
         decoder: a decoder that stays fixed; if None, a new decoder is trained together with the latent codes.
@@ -118,7 +119,8 @@ def train(
 
 
 def _numbered(tables: nma.Tables) -> Pool:
-    """Returns a pool of the tables. The only parameter of a material is its index, which selects its latent code."""
+    """Returns the tables as training data. Each material's only parameter is its index, which selects its latent
+    code."""
     numbers = np.arange(len(tables.params), dtype=np.float64)[:, None]
     return Pool.of(replace(tables, params=numbers))
 

@@ -4,7 +4,7 @@
 
 First trains a direct evaluator on the adapters' dataset: a decoder, and a latent code for each material (evaluator.py).
 Then fits latent codes for the 89 validation materials to the materials' own references, as the paper does for Fan et
-al. 2022. The adapters were not trained on the validation materials: they compute the BRDF from the materials'
+al. 2022. The adapters were not trained on the validation materials, but compute the BRDF from the materials'
 parameters. The direct evaluator and the adapters are evaluated at random points in every bin, and the values are
 averaged over each bin. A killed training continues from its checkpoint in out/figures/direct.
 
@@ -40,8 +40,8 @@ from nma.table.dataset import Settings, simulate_block
 
 SET = "range"
 NETWORK, QUICK_NETWORK = "5x512", "2x32"
-# Points per bin for the adapters (as in the paper) and for the direct evaluator. The evaluator gets fewer points,
-# because it is slow and varies little within a bin.
+# Points per bin for the adapters (as in the paper) and for the direct evaluator. The direct evaluator is slow, and its
+# values vary little within a bin, so it is evaluated at fewer points.
 POINTS, DIRECT_POINTS = 10, 2
 # The number of points that are evaluated at a time.
 BATCH = 8192
@@ -98,7 +98,8 @@ def main() -> None:
 
 
 def train(arguments: Any, reference: nma.Tables) -> tuple[direct.Evaluator, dict[str, Any]]:
-    """Returns the evaluator with latent codes of the validation materials, and the bins and seconds of its training."""
+    """Returns the evaluator with latent codes of the validation materials, and the number of bins and the seconds of
+    its training."""
     quick, kept = arguments.quick, common.ROOT / "out/figures/direct"
     kept.mkdir(parents=True, exist_ok=True)
     settings, tables = data(arguments.data, quick)
@@ -129,7 +130,7 @@ def data(path: Path, quick: bool) -> tuple[Settings, nma.Tables]:
 
 
 def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
-    """Returns a function that evaluates the adapter, and runs its network at every point, as in the paper."""
+    """Returns a function that evaluates the adapter and runs the adapter's network at every point, as in the paper."""
     encode, materials = encoding.get(adapter.encoding), params.astype(np.float32)
 
     def at_points(material: jax.Array, wi: Vec3, wo: Vec3) -> jax.Array:
@@ -147,7 +148,8 @@ def of_evaluator(trained: direct.Evaluator) -> Evaluate:
 
 
 def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any, Vec3, Vec3], NDArray]:
-    """Returns the compiled function, applied to batches of points that fit into the cache of a CPU."""
+    """Compiles `at_points`, and returns a function that applies it to all points in batches that fit into a CPU's
+    cache."""
 
     @jax.jit
     def compiled(material: Any, wi: Vec3, wo: Vec3) -> jax.Array:
@@ -197,7 +199,7 @@ def print_means(name: str, result: dict[str, Any]) -> None:
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """Returns our Table 5 in Markdown, with the rows of the paper's Table 5 below our rows."""
+    """Returns a Markdown table with our results, and below these the results of the paper's Table 5."""
     lines = ["| | " + " | ".join(COLUMNS.values()) + " | time, s | parameters |", "|---" * 8 + "|"]
     for name, result in results.items():
         cells = [f"{result['mean'][k]:.4g}" for k in COLUMNS]
@@ -210,7 +212,7 @@ def markdown(results: dict[str, Any]) -> str:
         cells = [f"{row[k]:.4g}" if k in row else "" for k in COLUMNS]
         lines.append(f"| {name} | " + " | ".join([*cells, f"{row['seconds']:.4g}", ""]) + " |")
     noise = next(iter(results.values()))["mean"]["noise_floor"]
-    return "\n".join(lines) + f"\n\nNoise of the references: {noise:.5f} in log loss.\n"
+    return "\n".join(lines) + f"\n\nThe noise of the references alone gives a log loss of {noise:.5f}.\n"
 
 
 def plot(results: dict[str, Any], path: Path) -> None:

@@ -1,11 +1,11 @@
-"""Directional albedo of the shipped adapters for 100,000 random materials and 64 angles. No albedo exceeds 1 (eq. 5).
+"""The largest directional albedo of the shipped adapters at 64 angles, for 100,000 random materials (eq. 5: at most 1).
 
     python -m figures.energy.run [--quick]
 
 The albedo is estimated as the mean of value / pdf over samples that the adapter draws. The first round estimates the
 albedo of all pairs of material and angle with few samples. Each further round estimates the brightest pairs again, with
 more samples. Every round makes two independent estimates, whose difference gives the statistical error. All rounds are
-repeated without the energy bound.
+repeated without the bound on the albedo.
 
 Writes energy.json and energy.png beside this file. With --quick, takes 500 materials and writes to out/figures/energy.
 """
@@ -27,7 +27,7 @@ from nma.lattice import lattice_points
 
 ANGLES = 64
 CHUNK = 1_000_000
-# For each round: the number of pairs of material and angle (None for all pairs), and the number of samples per pair.
+# Each round: the number of pairs of material and angle (None for all pairs), and the number of samples per pair.
 ROUNDS = ((None, 64), (50_000, 1024), (2_000, 16_384), (100, 2**20))
 QUICK_ROUNDS = ((None, 64), (1_000, 1024), (100, 2**16))
 
@@ -80,7 +80,7 @@ def albedos(
         params: materials (n, 13).
         mu: cosines of the angles (ANGLES,).
         pairs: for each pair, the index material * ANGLES + angle.
-        shift: offset that is added to the sample points, modulo 1. Another offset gives another estimate.
+        shift: offset that is added to the sample points, modulo 1. Different offsets give independent estimates.
     """
     chunk = max(1, min(CHUNK, 2**28 // samples))
     parts = np.array_split(pairs, -(-len(pairs) // chunk))

@@ -1,4 +1,4 @@
-"""Pictures of the named materials in the preview scene, and the noise of pictures in the two lightings.
+"""Pictures of the named materials in the preview scene, and the noise of pictures in the scene's two lightings.
 
     python -m figures.gallery.run [--quick] [--adapter FILE]
 
@@ -45,13 +45,13 @@ SIX = (
     "frosted-silver",
 )
 CLAMP = 5.0
-# A firefly is a pixel that is brighter than FIREFLY times the median of its neighbourhood, and exceeds this median by
-# more than VISIBLE.
+# A firefly is a pixel whose brightness is more than FIREFLY times the median of its neighbourhood, and exceeds this
+# median by more than VISIBLE.
 FIREFLY, VISIBLE = 5.0, 0.02
 
 
 class Effort(NamedTuple):
-    """Sizes of the pictures (pixels on a side) and samples per pixel.
+    """Width of the square pictures in pixels, and samples per pixel.
 
     `size` and `spp` are for the two sheets of pictures. `noise_size` and `noise_spp` are for the pictures whose noise
     is measured, and `reference_spp` is for the converged pictures that the noisy pictures are compared with.
@@ -164,7 +164,7 @@ def noise(name: str, bsdf: dict[str, Any], effort: Effort) -> dict[str, dict[str
     found = {}
     for label, way in WAYS.items():
         converged = references[way.lighting]
-        # The first rendering compiles the kernels, so that the measured time excludes compilation.
+        # This first rendering compiles the kernels, so that the time measured below excludes compilation.
         render(bsdf, effort.noise_size, 1, way)
         began = time.process_time()
         picture = render(bsdf, effort.noise_size, effort.noise_spp, way, seed=2)

@@ -3,10 +3,10 @@
     python -m figures.library.run [--quick] [--steps N] [--data FILE] [--new FILE] [--held-out N] [--size N] [--spp N]
 
 Trains a library as `nma train-library` does, and compares each material of the library with the material's table. Then
-learns latent codes of materials that the library was not trained on, and renders mixtures of the codes of four
+learns latent codes of materials that the library was not trained on, and renders mixtures of the latent codes of four
 materials. The networks of NBRDF-MERL and the measured material are not part of this repository: `--data` and `--new`
-name their files. Tables, weights and metrics are kept in out/figures/library, so a killed run does not compute them
-again.
+name their files. Tables, weights and metrics are kept in out/figures/library, so a killed run continues where it
+stopped.
 
 Prints library.md, and writes library.md, library.json and library.png beside this file. With --quick, trains briefly on
 four of Mitsuba's BSDFs and writes to out/figures/library.
@@ -43,9 +43,9 @@ NEW = DATA / "rgl/cc_ibiza_sunset_rgb.bsdf"
 # The materials in the grid's corners (top left, top right, bottom left, bottom right): metal, paint, matte and plastic.
 CORNERS = ("brass", "color-changing-paint2", "pink-fabric", "green-plastic")
 CELLS = 7
-# The pictures in the plot are brightened by this many stops. FLIP is computed from the original pictures.
+# The pictures in the plot are brightened by EXPOSURE stops. FLIP is computed from the original pictures.
 EXPOSURE = 1.0
-# To compare an adapter with a table, the network runs at this many values of cos(theta_i) in each row of the table.
+# To compare an adapter with a table, the network runs at DIRECTIONS values of cos(theta_i) in each row of the table.
 DIRECTIONS = 16
 # Correlated multi-jittered samples, as in figures/rendered.
 SAMPLER = "multijitter"
@@ -150,7 +150,8 @@ def trained(
 
 
 def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]:
-    """Returns log loss, albedo error and noise floor of each material of the library, sorted by log loss."""
+    """Returns log loss, albedo error and noise floor of each material, sorted by log loss. The noise floor is the log
+    loss that the noise of the material's table alone gives."""
     known = Tables(library.codes.astype(np.float64), tables.values, tables.walks, tables.error)
     found = common.kept(path, lambda: common.figures(library.adapter, known, DIRECTIONS))
     wanted = ("log_loss", "albedo_error", "noise_floor")
@@ -162,7 +163,8 @@ def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]
 
 
 def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[str, Any]:
-    """Learns the code of a new material. Returns the log loss, the library's nearest material, and the seconds."""
+    """Learns the latent code of a new material. Returns its log loss, the library's most similar material, and the
+    seconds."""
     began = time.perf_counter()
     found = training.encode(library, tables, recipe=replace(training.ENCODING, steps=steps))
     row = {"name": name, "log_loss": round(found.log_loss, 6), "nearest": found.nearest}
@@ -174,7 +176,7 @@ def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[st
 def unseen(
     members: Sequence[Member], tables: Tables, recipe: Recipe, arguments: argparse.Namespace, kept: Path
 ) -> list[dict[str, Any]]:
-    """Trains a second library that lacks every n-th material, and then learns the codes of the missing materials."""
+    """Trains a second library without --held-out of the materials, and then learns latent codes for these materials."""
     if not arguments.held_out:
         return []
     out = np.linspace(0, len(members), arguments.held_out, endpoint=False).astype(int) + 1
@@ -225,7 +227,7 @@ def fit(library: Library, code: NDArray, kept: Path) -> dict[str, Any]:
 
 
 def measured(member: Member) -> dict[str, Any]:
-    """Returns the BSDF `values`, which renders the member's own values without an adapter."""
+    """Returns the BSDF `values`, which renders the BRDF values of a material without an adapter."""
     chosen = {"material": member.material} if member.material else {}
     return {"type": "values", "file": str(member.path)} | chosen
 
@@ -236,8 +238,8 @@ def markdown(data: dict[str, Any]) -> str:
     albedos = [row["albedo_error"] for row in data["fits"]]
     worst = data["fits"][-1]
     lines = [
-        f"{data['materials']} materials ({data['origin']}), {data['parameters']:,} parameters, "
-        f"{data['recipe']['steps']} steps in {data['seconds']:.0f} s.",
+        f"The library has {data['materials']} materials ({data['origin']}) and {data['parameters']:,} parameters, "
+        f"and was trained for {data['recipe']['steps']} steps in {data['seconds']:.0f} s.",
         "",
         "| | mean | median | worst |",
         "|---|---|---|---|",
