@@ -72,7 +72,7 @@ def check() -> list[Finding]:
         _system(),
         _python(),
         *([_libatomic()] if sys.platform == "linux" else []),
-        _llvm(),  # before `_module`, because `_module` imports Dr.Jit, which then loads libLLVM
+        _llvm(),  # precedes `_module`, because `_module` imports Dr.Jit, which then loads libLLVM
         *(_module(name, distribution=distribution) for name, distribution in needed.items()),
         _cuda(),
         *(_module(name, "training") for name in ("jax", "optax")),
@@ -90,7 +90,7 @@ def _advice(what: str) -> str:
 
 
 def _system() -> Finding:
-    """Checks whether the operating system is supported. All tests of this package run on Linux."""
+    """Checks whether the operating system is supported. This package is tested on Linux only."""
     system = llvm.platform()
     if system == "windows":
         return Finding("system", False, "Windows is not supported; use Linux in WSL", llvm.install_command())
@@ -135,7 +135,8 @@ def _module(name: str, purpose: str = "", distribution: str = "") -> Finding:
     distribution = distribution or name
     try:
         importlib.import_module(name)
-    except Exception as error:  # a missing shared library may raise another exception than ImportError
+    except Exception as error:
+        # If a shared library is missing, the import may raise an error other than ImportError.
         found = f"for {purpose}; not installed" if purpose else f"cannot be imported: {error}"
         fix = f"{sys.executable} -m pip install '{_requirement(distribution)}'"
         return Finding(name, False, found, fix, bool(purpose))

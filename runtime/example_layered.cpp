@@ -4,12 +4,12 @@
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered
 //
-// - Walks alone: the direction in which a walk leaves is drawn by the material, so the walk seldom meets a small lamp.
+// - Walks alone: a random walk leaves the material in a random direction, so few walks meet a small lamp.
 // - Evaluation alone: the directions to the lamp are drawn uniformly, so most of them miss the peak of a narrow lobe.
 // - Walks and evaluation: a path tracer combines the two estimates above by multiple importance sampling (Veach 1997,
-//   eq. 9.8). The weights of multiple importance sampling need the density of a walk, which has no closed form. The
-//   mean stays the same with another density, if the weights of both estimates use the same density. `pdf` is close to
-//   the density of a walk, so the noise is small.
+//   eq. 9.8). The weights of multiple importance sampling contain the density of a walk's direction, which has no
+//   closed form. The program uses `pdf` in its place. The mean stays the same, because the weights of both estimates
+//   use `pdf`, and the noise is small, because `pdf` is close to the density of a walk's direction.
 // - Samples of `sample`: blends and masks of materials compute weights from the densities of samples, so they need
 //   samples whose exact density is known. Directions that `sample` draws have exactly the density `pdf`.
 #include <cstdio>
@@ -66,8 +66,8 @@ int main() {
         const Vec wo = towards_lamp(random.uniform(), random.uniform());
         const Vec seen = layered::evaluate(gold, VIEW, wo, random) * (1.0f / LAMP_PDF);
 
-        // The weight of a walk that leaves in the direction w towards the lamp. The evaluation has the remaining
-        // weight.
+        // The weight of a walk that leaves in the direction w towards the lamp. The weight of the evaluation for w is 1
+        // minus this weight.
         const auto odds = [&](const Vec& w) {
             return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF);
         };

@@ -44,8 +44,9 @@ struct Options {
     // avx512_bf16. avx512_bf16 rounds weights and activations to bfloat16, which keeps 8 significant bits, and so
     // halves the time of a network on some CPUs.
     InstructionSet set = fastest();
-    // Rounds weights to bfloat16, which halves the memory that a query has to read. The rounding raised the log loss of
-    // both shipped adapters by less than .00002. The instruction set avx512_bf16 always rounds weights.
+    // Rounds weights to bfloat16, which halves the memory that a query has to read. The rounding raised the log loss
+    // (runtime/README.md) of both shipped adapters by less than .00002. The instruction set avx512_bf16 always rounds
+    // weights.
     bool compact = false;
 };
 
@@ -75,9 +76,9 @@ public:
     // The vector is empty if the adapter was trained on a class.
     const std::vector<float>& material() const { return weights_.material; }
     // The index of the first number that is not allowed, or -1 if all numbers are allowed. A number is allowed if it is
-    // finite and lies in its training range. Outside that range, the BRDF looks plausible, but does not match the
-    // source material. If the adapter was fitted to a single material, only the parameters of that material are
-    // allowed. `parameter(index)` returns the parameter that the number with this index belongs to.
+    // finite and lies in its training range. Outside the training range, the BRDF looks plausible, but does not match
+    // the source material. If the adapter was fitted to a single material, only the parameters of that material are
+    // allowed. `parameter(index)` returns the parameter to which the number at `index` belongs.
     int check(const float* parameters) const {
         for (int k = 0; k < parameter_count(); ++k)
             if (!allowed(k, parameters[k])) return k;
@@ -89,7 +90,7 @@ public:
         if (!material().empty()) return;
         for (int k = 0; k < parameter_count(); ++k) parameters[k] = parameter(k).clamped(parameters[k]);
     }
-    // The parameter that the number with this index belongs to.
+    // The parameter to which the number at `index` of the array `parameters` belongs.
     const SourceParam& parameter(int index) const { return weights_.parameters[owners_[index]]; }
 
     // The count of numbers that the network returns for a query. These numbers describe a blend.
@@ -192,7 +193,7 @@ private:
 
     const Kernels& kernels() const { return network_.kernels_in_use(); }
 
-    // Whether x is allowed as the number with index `k`: see `check`.
+    // Whether x is allowed as the number at index `k` of the parameters: see `check`.
     bool allowed(int k, float x) const {
         if (material().empty()) return parameter(k).allows(x);
         return same(x, material()[k]);
@@ -319,7 +320,8 @@ public:
     }
 
     // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of each node sum to 1, so the
-    // interpolated weights sum to 1, too. The same is true for the lobe probabilities.
+    // interpolated weights sum to 1, too. The lobe probabilities of each node also sum to 1, and so do the interpolated
+    // probabilities.
     Brdf at(float cos_theta_i) const {
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);

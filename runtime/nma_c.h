@@ -51,15 +51,15 @@ NMA_C_API nma_adapter* nma_from_memory(const void* bytes, size_t size, int instr
 NMA_C_API void nma_free(nma_adapter* adapter);
 
 NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
-/* The name and the training range (its lower and upper end) of the parameter that the number with this index belongs
- * to. The index must be at least 0 and less than nma_parameter_count. */
+/* The name and the training range (its lower and upper end) of the parameter to which the number at `index` of the
+ * array `parameters` belongs. `index` must be at least 0 and less than nma_parameter_count. */
 NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int index);
 NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int index, float range[2]);
 /* Whether the adapter was fitted to a single material. For a single material, this function writes its parameters. */
 NMA_C_API int nma_single_material(const nma_adapter* adapter, float* parameters);
 /* The index of the first number that is not allowed, or -1 if all numbers are allowed. A number is allowed if it is
- * finite and lies in its training range. Outside that range, the BRDF does not match the source material. If the
- * adapter was fitted to a single material, only the parameters of that material are allowed. */
+ * finite and lies in its training range. Outside the training range, the BRDF does not match the source material. If
+ * the adapter was fitted to a single material, only the parameters of that material are allowed. */
 NMA_C_API int nma_check(const nma_adapter* adapter, const float* parameters);
 /* Moves each number into its training range, and NaN to the lower end of the range. */
 NMA_C_API void nma_clamp(const nma_adapter* adapter, float* parameters);

@@ -27,7 +27,8 @@ class Conductors:
         return len(self.names)
 
     def distinct(self) -> np.ndarray:
-        """The indices of the distinct rows, ascending. Some substances are in the table twice, under two names."""
+        """The row numbers of the distinct metals, ascending. Some substances are in the table twice, under two
+        names."""
         _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
         return np.sort(first)
 

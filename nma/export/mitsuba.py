@@ -30,8 +30,8 @@ def principled_dict(p: Principled) -> dict[str, Any]:
     nma/target/principled.py.
 
     `specular` is replaced by the `eta` with the same reflectance in two cases: if `specular` is above 1, which is
-    Mitsuba's limit, and if it is 0, for which Mitsuba leaves out the reflection of metals. Raises `ParamError` for
-    parameters that Mitsuba's plugin does not have, and for values that Mitsuba does not allow.
+    Mitsuba's limit, and if `specular` is 0, because Mitsuba then leaves out the reflection of metals. Raises
+    `ParamError` for parameters that Mitsuba's plugin does not have, and for values that Mitsuba does not allow.
     """
     values = {name: float(getattr(p, name)) for name in _FIELDS}
     base_color = [float(c) for c in p.base_color]
@@ -42,7 +42,7 @@ def principled_dict(p: Principled) -> dict[str, Any]:
         # `specular` is 12.5 for an infinite index of refraction, so values from 12.5 on have no `eta`.
         high = 12.0 if name == "specular" else 1.0
         if not 0.0 <= value <= high:
-            raise ParamError(f"{name} is {value:g}, Mitsuba's principled allows 0 .. {high:g}")
+            raise ParamError(f"{name} is {value:g}, but Mitsuba's principled allows 0 .. {high:g}")
     specular = values["specular"]
     if not _MIN_SPECULAR <= specular <= 1.0:
         del values["specular"]

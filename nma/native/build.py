@@ -95,8 +95,8 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
         for name in PLUGINS:
             plugin = into / "plugins" / f"{name}{_suffix()}"
             say(f"compiling {plugin.name}")
-            # The flags come last, because the linker looks for a file's symbols only in the libraries that are named
-            # after the file.
+            # The flags follow the source file, because the linker looks for the symbols of a file only in the libraries
+            # that follow the file on the command line.
             _compile([sources() / "mitsuba" / f"{name}.cpp", "-o", plugin], flags)
         shutil.copytree(_ADAPTERS, into / "adapters")
     return folder

@@ -58,7 +58,7 @@ class Runtime:
             class.
         size: the number of the network's outputs.
         instruction_set: the instruction set in use.
-        anisotropic: whether the adapter depends on the azimuth of `wi`.
+        anisotropic: whether the BRDF depends on the azimuth of `wi`.
 
     Raises:
         WeightsError: the file is missing or damaged.
@@ -101,8 +101,8 @@ class Runtime:
 
         Args:
             params: the parameters (n, parameters) of n materials, within the training range.
-            wi: view directions (n, 3), unit vectors above the horizon. For isotropic adapters, the cosines (n,) of
-                these directions with the normal, in 0..1, are enough.
+            wi: view directions (n, 3), unit vectors above the horizon. For isotropic adapters, `wi` may instead be the
+                cosines (n,) of the view directions with the normal, in 0..1.
             clamp: clamp parameters to the training range instead of raising an error.
 
         Raises:

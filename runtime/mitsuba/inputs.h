@@ -29,7 +29,7 @@ struct Input {
     // into the range of the parameter. If a texture object is shared, another owner may edit the texture without a call
     // to this input, and then `value` is out of date.
     Colour value, shown;
-    // If the parameter has one number, this is the index of the texture channel that it reads, or -1 if no channel was
+    // For a parameter of one number: the index of the texture channel that the parameter reads, or -1 if no channel was
     // chosen.
     int channel = -1;
     // Whether all numbers of the texture are known before rendering.

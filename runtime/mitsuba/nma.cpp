@@ -79,8 +79,8 @@ private:
     }
 
     // The parameters that the BSDF reads are those of the adapter's class. If the adapter was fitted to a single
-    // material, the BSDF reads no parameters. A scene may then give the parameters of that material, but no other
-    // values.
+    // material, the BSDF reads no parameters. For such an adapter, the scene may give the parameters of the single
+    // material, but no other values.
     static std::vector<SourceParam> wanted(const Properties& props, const nma::Adapter& adapter) {
         if (adapter.material().empty()) return adapter.parameters();
         const float* known = adapter.material().data();
@@ -91,7 +91,7 @@ private:
         return {};
     }
 
-    // Throws if the property of parameter `p` differs from `known`, which are its numbers in the single material.
+    // Throws if the property of parameter `p` differs from `known`, the numbers of `p` in the single material.
     static void refuse_others(const Properties& props, SourceParam p, const float* known) {
         p.low = -1e30, p.high = 1e30;
         const Inputs given(props, {p}, false);
@@ -115,8 +115,8 @@ private:
         curves_ = std::make_unique<nma::Curves>(adapter_, parameters);
     }
 
-    // Loads the weights file `name`. Mitsuba's file resolver searches it beside the scene, and beside the plugins,
-    // where the shipped adapters are.
+    // Loads the weights file `name`. Mitsuba's file resolver looks for the file beside the scene, and beside the
+    // plugins, where the shipped adapters are.
     static nma::Adapter load(const std::string& name, std::string_view precision) {
         const auto resolver = file_resolver();
         auto path = resolver->resolve(name);
@@ -169,10 +169,10 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value that this plugin returns to Mitsuba. On a path from the camera, the function returns the argument
-    // `value`. On a path from the light, `wo` points towards the camera, so the function prepares a blend for `wo`. A
-    // blend is not reciprocal, so on a path from the light the blend prepared for `si.wi` would return another value
-    // than on a path from the camera.
+    // The value that this plugin returns to Mitsuba. On a path from the camera, that is the argument `value`, which
+    // comes from the blend for the view direction `si.wi`. On a path from the light, the view direction is `wo`, so the
+    // function prepares a blend for `wo`. A blend is not reciprocal, so the blend for `si.wi` would make paths from the
+    // light and paths from the camera disagree.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

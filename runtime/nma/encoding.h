@@ -117,7 +117,7 @@ private:
         const Four k2 = k * k, less = n - one, more = n + one;
         Four grazing = fresnel_conductor<Four>(Four(GRAZING), n, k);
         // `normal` is the reflectance at normal incidence, |eta - 1|^2 / |eta + 1|^2, where eta = n + i k is the
-        // complex index.
+        // complex index of refraction.
         Four normal = (less * less + k2) / (more * more + k2), albedo = four(p + layered3::ALBEDO);
         const Four plain{p[layered3::ALPHA_TOP], p[layered3::ALPHA_BOTTOM], eta_top, sigma_t};
         const Four bent = plain + (log(maximum(plain, Four(1e-30f))) - plain) * log_;

@@ -103,7 +103,7 @@ struct Kernels {
     // Runs the network for many queries, each of which has a row of inputs and a row of outputs.
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
-    // `encode` fills in a row of inputs. `decode` makes a blend of `raw`, a row of outputs, and overwrites `raw`.
+    // `encode` fills in a row of inputs. `decode` computes a blend from `raw`, a row of outputs, and overwrites `raw`.
     // `set_lobe_probabilities` then completes the blend. `decode` uses wide vectors, and `set_lobe_probabilities` uses
     // narrow vectors. Some CPUs run narrow vector instructions at half the speed while wide vector instructions are
     // running. So `prepare_many` calls `decode` for all queries of a block before it calls `set_lobe_probabilities`.

@@ -1,8 +1,8 @@
 // `Lanes<T>` is a vector of four numbers of type T. With `Lanes<T>` as their number type, the functions of
 // generated/target.h evaluate four instances at once.
 //
-// With GCC and Clang, four floats are a vector register of the instruction set that every CPU of the target
-// architecture has. Four doubles are an array, and with other compilers four floats are an array, too.
+// With GCC and Clang, four floats are in a vector register, because every CPU of the target architecture has vector
+// registers of this size. Four doubles are in an array. With other compilers, four floats are in an array, too.
 #pragma once
 
 #include <cstdint>

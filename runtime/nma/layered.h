@@ -66,10 +66,10 @@ struct Walk {
 namespace detail {
 
 inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)); }
-// `w` moved slightly above the horizon, where visible normals are undefined.
+// `w`, moved slightly above the horizon, because visible normals are undefined at the horizon.
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
-// The inverse of a density, which is large for a wide lobe. `unscattered` computes the weights of connections from this
-// inverse.
+// The inverse of the density of an event. The wider the lobe of the event, the larger is this inverse. `unscattered`
+// computes weights from the inverse.
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
 // The reflectance of the conductor, per colour channel.
@@ -85,7 +85,7 @@ inline float transmittance(const Stack& stack, float depth, const Vec& w) {
     return stack.sigma_t > 0.0f ? exp(-stack.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
 }
 
-// Russian roulette on the brightest channel. Walks with `exempt` always survive.
+// Russian roulette on the brightest channel. If `exempt` is true, the walk always survives.
 inline void roulette(Walk& walk, bool exempt, bool trapped, Random& random) {
     if (exempt) return;
     const float chance =
@@ -164,13 +164,13 @@ struct Way {
     Vec direction, reached;
 };
 
-// One segment of a walk, other than its first, that is chosen by weighted reservoir sampling (Chao 1982).
+// One segment of a walk, chosen from all segments except the first by weighted reservoir sampling (Chao 1982).
 struct Detour {
     Vec direction, tint{0.0f, 0.0f, 0.0f};
     float total = 0.0f;
 
-    // Replaces the chosen segment by the current segment of `walk`, with a probability in proportion to the brightest
-    // channel of its throughput.
+    // Replaces the chosen segment by the current segment of `walk`, with a probability proportional to the brightest
+    // channel of the current throughput.
     void offer(const Walk& walk, Random& random) {
         const float weight = walk.alive ? max_component(walk.throughput) : 0.0f;
         total += weight;
@@ -181,9 +181,9 @@ struct Detour {
     }
 };
 
-// Returns two numbers (q, t) for light that leaves through the coat's surface: the light goes up along `up` inside of
-// the coat, and along wo outside. q [1/sr] is the density of `up` if a walk from wo is refracted at a visible normal. q
-// t [1/sr] is the value of the refraction from `up` to wo, which is transmitted radiance times cos(theta_o).
+// Returns two numbers (q, t) for light that leaves through the coat's surface. Inside the coat, the light travels along
+// `up`. Outside, the light travels along wo. q [1/sr] is the density with which a walk from wo is refracted into -up at
+// a visible normal. q t [1/sr] is the density with which light along `up` is refracted to wo.
 inline std::pair<float, float> out_through_coat(const Stack& stack, const Vec& wo, const Vec& up) {
     const float alpha = stack.alpha_top, eta = stack.eta_top;
     const bool matched = eta == 1.0f;
@@ -209,14 +209,19 @@ inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
     return visible_normal_pdf<float>(w, m, alpha, alpha) / (4.0f * maximum(dot(w, m), 1e-7f));
 }
 
-// Estimates the light from wi to wo that does not scatter in the medium. Sets `detour` to one segment of the walk
-// `there`, other than its first.
+// Estimates the light from wi to wo that does not scatter in the medium. Also chooses a segment of the walk `there`
+// (see `Detour`), and stores it in `detour`.
 //
-// A path is sampled from both ends: the walk `there` starts at wi, and the walk `back` starts at wo. A connection joins
-// a segment of `there` to the first segment of `back`, or to wo. The walks draw all events of the path at random except
-// the connection, for which the function evaluates its scattering density instead. Several choices of the connection
-// could make the same path. `share` is the multiple importance sampling weight of one choice. `share` is large if the
-// density at the connection is small, as in a wide lobe.
+// The light enters through the coat, hits the conductor once or more, and leaves through the coat. The walk `there`
+// starts at wi, and the walk `back` starts at wo. Each refraction or reflection on the light path is an event. The
+// walks draw all events at random except one, the connection, where the two walks are joined. The density of the
+// connection is evaluated instead.
+//
+// The connection is either the last hit of the conductor or the exit through the coat. `evaluate` calls this function a
+// second time with wi and wo exchanged and `forward` false. In the second call, the connection is the first hit or the
+// entrance, seen from wi. Each connection has a weight `share` of multiple importance sampling, because several
+// connections can make the same path (balance heuristic, Veach 1997, eq. 9.8). `share` is proportional to the
+// `bluntness` of the connection, so connections with narrow lobes get small weights.
 inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, const Vec& wo, const Walk& back,
                        Random& random, bool forward, Way& detour) {
     const Vec drawn_up = -back.direction;
@@ -234,11 +239,12 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
         walk = before;
         step(stack, 0.0f, walk, random);
         kept.offer(walk, random);
-        // Skips visits to the coat: only visits to the conductor are connected.
+        // The loop skips hits of the coat, because a connection is made only at or after a hit of the conductor.
         if (walk.height >= 1.0f) continue;
         const Vec w_in = -before.direction;
         const float rest = way_in + first;
-        // First choice: the connection is the last visit to the conductor.
+        // Connects at this hit, as the last hit of the conductor. A path with a single hit is connected there only if
+        // `forward` is true, so that it is counted once.
         float blunt = bluntness(sharpness(stack, w_in, drawn_up));
         float share = matched ? 1.0f : blunt / (blunt + rest + blunt_q);
         if (!forward && !(first > 0.0f)) share = 0.0f;
@@ -249,7 +255,7 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
                                  smith_g1<float>(drawn_up, stack.alpha_bottom, stack.alpha_bottom);
             total = total + before.throughput * conductor(cosine, stack) * weight;
         }
-        // Second choice: the connection is the refraction out through the coat.
+        // Connects at the exit: the light goes up after this hit and is refracted to wo.
         blunt = bluntness(sharpness(stack, w_in, walk.direction));
         if (!matched) {
             const auto [q, t] = out_through_coat(stack, wo, walk.direction);
@@ -264,8 +270,8 @@ inline Vec unscattered(const Stack& stack, const Vec& wi, const Walk& there, con
     return total;
 }
 
-// Estimates the light that scatters in the medium. Every scattering event of the walk is connected to each of the
-// segments `ways`.
+// Estimates the light that scatters in the medium. Every scattering event of `walk` is connected to both of the
+// segments `ways`, which belong to a walk from wo.
 inline Vec scattered(const Stack& stack, Walk walk, const Way (&ways)[2], Random& random) {
     Vec total{0.0f, 0.0f, 0.0f};
     if (!(stack.sigma_t > 0.0f)) return total;
@@ -326,8 +332,8 @@ inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
 }
 
 // The intermediate results of `pdf` that depend on wi only. `coat`, `bottom` and `diffuse` are the weights of three
-// lobes, and sum to 1. The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a
-// cosine lobe. `width` is the roughness of the second lobe, and `inside` is wi refracted into the coat.
+// lobes: the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The weights sum to
+// 1. `width` is the roughness (alpha) of the conductor's lobe, and `inside` is wi refracted into the coat.
 struct Density {
     float coat, bottom, diffuse, width;
     Vec inside;

@@ -65,7 +65,7 @@ public:
         const auto narrow = [](const LayerView& layer) { return layer.width == NARROW; };
         view_.narrow = !pairs && std::all_of(view_.layers, view_.layers + view_.depth, narrow);
         if (view_.narrow)
-            for (int k = 0; k < view_.depth; ++k) view_.layers[k].turned = keep_turned(view_.layers[k]);
+            for (int k = 0; k < view_.depth; ++k) view_.layers[k].diagonals = keep_diagonals(view_.layers[k]);
     }
 
     InstructionSet instruction_set() const { return kernels_->set; }
@@ -105,9 +105,9 @@ private:
         return to;
     }
 
-    const float* keep_turned(const LayerView& view) {
+    const float* keep_diagonals(const LayerView& view) {
         float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
-        // In the notation of layout.h, i is 4 b + r, and j is 4 g + k.
+        // In the notation of layout.h, i = 4 b + r and j = 4 g + k.
         for (int i = 0; i < view.in; ++i)
             for (int j = 0; j < view.width; ++j) {
                 const int input = i / 4 * 4 + j % 4, neuron = j / 4 * 4 + (j + i) % 4;

@@ -1,7 +1,7 @@
 // x86-64 with AVX-512 F, BW, DQ and VL: sixteen lanes, 32 registers.
 //
 // After the common functions of body.inl, this file has functions for narrow networks, whose activations stay in
-// registers. These functions read `LayerView::turned`, which layout.h explains.
+// registers. These functions read `LayerView::diagonals`, which layout.h explains.
 #pragma once
 
 #include <cstring>
@@ -49,7 +49,7 @@ NMA_OP Vec odd(const std::uint32_t* pairs) {
 }
 
 // A version of `Indexed` (preparation.h) for at most 32 numbers, which are in two registers instead of memory. A call
-// reads `LANES` indices, which are 4, and returns the numbers with these indices.
+// reads four indices, and returns the numbers at these indices.
 struct Few {
     static constexpr int MOST = 2 * VEC_SIZE;
     Vec low, high;
@@ -74,26 +74,26 @@ template <int B>
 NMA_OP Vec repeat(Vec v) {
     return _mm512_maskz_shuffle_f32x4(ALL, v, v, B * 0x55);
 }
-// Rotates the lanes of each block: lane k becomes lane (k + R) % 4.
+// Rotates the lanes of each block: the number in lane k moves to lane (k + R) % 4.
 template <int R>
-NMA_OP Vec turn(Vec v) {
+NMA_OP Vec rotate(Vec v) {
     return _mm512_maskz_permute_ps(ALL, v, R == 1 ? 0x93 : 0x4e);
 }
 
 // Adds the contributions of four inputs to the sums of 16 neurons. `inputs` repeats the four inputs in all blocks.
-// `columns` points to the four columns of `LayerView::turned` for these inputs. `total` later rotates sum r by r lanes.
+// `columns` points to the four columns of `LayerView::diagonals` for these inputs.
 NMA_OP void add_block(Vec (&sums)[4], Vec inputs, const float* columns) {
     NMA_UNROLL for (int r = 0; r < 4; ++r) sums[r] = fma(inputs, load(columns + r * VEC_SIZE), sums[r]);
 }
-// The values of 16 neurons: rotates sum r by r lanes, and adds up the four sums.
+// The values of 16 neurons: rotates sums[r] by r lanes, and adds up the four rotated sums.
 NMA_OP Vec total(const Vec (&sums)[4]) {
-    return add(add(sums[0], turn<1>(sums[1])), turn<2>(add(sums[2], turn<1>(sums[3]))));
+    return add(add(sums[0], rotate<1>(sums[1])), rotate<2>(add(sums[2], rotate<1>(sums[3]))));
 }
 
 // Computes the first layer, whose inputs are in memory. The layer has NARROW neurons, which fill the two vectors `y`.
 NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
-        const float* column = layer.turned + v * layer.in * VEC_SIZE;
+        const float* column = layer.diagonals + v * layer.in * VEC_SIZE;
         Vec sums[4] = {load(layer.bias + v * VEC_SIZE), set(0.0f), set(0.0f), set(0.0f)};
         for (int i = 0; i < layer.in; i += 4) add_block(sums, repeat(x + i), column + i * VEC_SIZE);
         y[v] = total(sums);
@@ -107,7 +107,7 @@ NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
                           repeat<0>(b), repeat<1>(b), repeat<2>(b), repeat<3>(b)};
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
         Vec sums[4] = {load(layer.bias + v * VEC_SIZE), set(0.0f), set(0.0f), set(0.0f)};
-        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.turned + (v * 8 + k) * 4 * VEC_SIZE);
+        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.diagonals + (v * 8 + k) * 4 * VEC_SIZE);
         y[v] = total(sums);
     }
 }

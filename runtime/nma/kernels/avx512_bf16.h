@@ -18,8 +18,8 @@ namespace nma::avx512_bf16 {
 using avx512::Vec;
 using avx512::VEC_SIZE;
 
-// Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first neuron. `x` holds the
-// inputs in pairs. `tile` in body.inl is the version for float32.
+// Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first of these neurons. `x`
+// holds the inputs in pairs. `tile` in body.inl is the version for float32.
 template <int VECTORS, int QUERIES, int SUMS>
 NMA_FN inline void tile(const LayerView& layer, int first, const std::uint32_t* x, int x_stride, float* y,
                         int y_stride) {

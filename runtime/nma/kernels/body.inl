@@ -19,9 +19,9 @@
 // The members of `Kernels` point to the functions `forward`, `forward_many`, `encode`, `decode`,
 // `set_lobe_probabilities` and `prepare` below. The other functions in this file are helpers of these six.
 
-// Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first neuron. Each neuron has
-// SUMS partial sums, because each addition to a single sum would wait for the addition before it. PAIRS says whether
-// the weights are `LayerView::pairs` instead of `LayerView::columns`.
+// Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first of these neurons. Each
+// neuron has SUMS partial sums, because each addition to a single sum would wait for the addition before it. PAIRS says
+// whether the weights are `LayerView::pairs` instead of `LayerView::columns`.
 template <int VECTORS, int QUERIES, int SUMS, bool PAIRS>
 NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                         bool relu) {
@@ -69,8 +69,8 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
     }
 }
 
-// Computes all neurons of a layer from index `first` on, in tiles of VECTORS vectors. The neurons that remain are
-// computed in tiles of half the size.
+// Computes all neurons of a layer from index `first` on, in tiles of VECTORS vectors. Neurons that are too few for a
+// tile are computed in tiles of half the size.
 template <int VECTORS, int QUERIES, bool PAIRS>
 NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                          bool relu) {

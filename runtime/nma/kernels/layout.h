@@ -23,40 +23,44 @@ constexpr int NARROW = 32;
 // A layer maps `in` inputs to `width` neurons. `in` and `width` include the padding, whose weights are 0. A layer has
 // either `columns` or `pairs`:
 //
-//     columns  [in][width]      floats. Column i holds the weights from input i to all neurons.
-//     pairs    [in / 2][width]  two weights as bfloat16 in 32 bits: the weight from input 2 i in the low half, and the
-//                               weight from input 2 i + 1 in the high half. A single query waits for the memory of
-//                               the weights, which `pairs` halves.
-//     turned   [in][width]      the floats of `columns` in another order, for single queries on AVX-512. Narrow
-//                               networks have it in addition to `columns`.
+//     columns    [in][width]      floats. Column i holds the weights from input i to all neurons.
+//     pairs      [in / 2][width]  two weights as bfloat16 in 32 bits: the weight from input 2 i in the low half, and
+//                                 the weight from input 2 i + 1 in the high half. `pairs` has half the bytes of
+//                                 `columns`, which saves time, because a single query mostly waits for weights to be
+//                                 read from memory.
+//     diagonals  [in][width]      the weights of `columns` in another order, for single queries on AVX-512. Narrow
+//                                 networks have `diagonals` in addition to `columns`.
 //
-// `turned` needs fewer shuffle instructions than `columns` if the inputs are in a register. Each step of `columns`
-// multiplies column i by a vector that repeats input i in all its lanes, which takes one shuffle per input. Each step
-// of `turned` multiplies a column by a vector that repeats four inputs in their order, which takes one shuffle per four
-// inputs. The following example has four inputs x0 .. x3 and four neurons, and 2>3 is the weight from input 2 to neuron
-// 3:
+// `columns` needs one shuffle instruction for each input x_i, which copies x_i to all lanes of a vector. Column i is
+// multiplied by this vector. If the inputs are in registers, `diagonals` needs fewer shuffles: one shuffle copies four
+// inputs, and four columns are multiplied by the resulting vector. In the following example of four inputs and four
+// neurons, 2>3 is the weight from input 2 to neuron 3. Each column of `diagonals` is a diagonal of the matrix on the
+// left, continued at the other edge:
 //
-//     `columns`         neuron 0    1    2    3         `turned`            lane 0    1    2    3    adds to sum
-//     column 0, times x0     0>0  0>1  0>2  0>3         r = 0, times x0..x3    0>0  1>1  2>2  3>3    0
-//     column 1, times x1     1>0  1>1  1>2  1>3         r = 1, times x0..x3    0>1  1>2  2>3  3>0    1
-//     column 2, times x2     2>0  2>1  2>2  2>3         r = 2, times x0..x3    0>2  1>3  2>0  3>1    2
-//     column 3, times x3     3>0  3>1  3>2  3>3         r = 3, times x0..x3    0>3  1>0  2>1  3>2    3
+//     `columns`              neuron 0    1    2    3     `diagonals`              lane 0    1    2    3    is added to
+//     column 0, times x0          0>0  0>1  0>2  0>3     column 0, times x0..x3      0>0  1>1  2>2  3>3    sum 0
+//     column 1, times x1          1>0  1>1  1>2  1>3     column 1, times x0..x3      0>1  1>2  2>3  3>0    sum 1
+//     column 2, times x2          2>0  2>1  2>2  2>3     column 2, times x0..x3      0>2  1>3  2>0  3>1    sum 2
+//     column 3, times x3          3>0  3>1  3>2  3>3     column 3, times x0..x3      0>3  1>0  2>1  3>2    sum 3
 //
-// Lane k of sum r belongs to neuron (k + r) % 4. Therefore sum r is rotated once, by r lanes to the right, after the
-// products of all inputs were added to it. The neurons are the total of the four rotated sums. The weights of a layer
-// are divided into squares of 4 x 4 weights. Square (b, g) has the weights from the inputs 4 b .. 4 b + 3 to the
-// neurons 4 g .. 4 g + 3. Row r of square (b, g) is in column 4 b + r of `turned`, at the elements 4 g .. 4 g + 3. In
-// memory, the columns of the first WIDTH_STEP neurons are followed by the columns of the next WIDTH_STEP neurons.
+// Lane k of sum r holds products for neuron (k + r) % 4. After the products of all inputs were added, sum r is rotated
+// by r lanes to the right, so that lane j belongs to neuron j. Then the four rotated sums are added, which gives the
+// values of the neurons.
+//
+// A larger matrix of weights is divided into squares of 4 x 4 weights. Square (b, g) contains the weights from the
+// inputs 4 b .. 4 b + 3 to the neurons 4 g .. 4 g + 3. Diagonal r of square (b, g) is stored in column 4 b + r of
+// `diagonals`, at the elements 4 g .. 4 g + 3. In memory, the elements 0 .. 15 of all columns come first, then the
+// elements 16 .. 31 of all columns, and so on.
 struct LayerView {
     int in, width;
     const float* bias;
-    const float *columns, *turned;
+    const float *columns, *diagonals;
     const std::uint32_t* pairs;
 };
 
 struct NetworkView {
     int depth;    // count of layers
-    bool narrow;  // whether all layers have the width NARROW, and have `turned`
+    bool narrow;  // whether all layers have the width NARROW, and have `diagonals`
     LayerView layers[DEEPEST_NETWORK];
 };
 
