@@ -38,6 +38,12 @@ def fixed(mu, n):
     return direction(dr.opaque(Float, mu) + dr.zeros(Float, n))
 
 
+def test_a_coat_is_matched_if_its_index_is_below_1_001():
+    for eta, settled in ((1.00099, 1.0), (1.00101, 1.00101)):
+        layers = layers_of(CASES["white_coated"] | {"eta_top": eta}, 1)
+        assert layers.eta_top.numpy()[0] == np.float32(settled)
+
+
 def draw(layers, wi, rng):
     """Draws wo with the density `layered_eval.pdf`. An invalid sample has z < 0."""
     return layered_eval.sample(layers, wi, *(rng.next_float32() for _ in range(3)))
