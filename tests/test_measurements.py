@@ -89,11 +89,11 @@ def test_faults_are_named_file_by_file(data, uniform, measurements):
     assert (code, err) == (1, "")
     found = {line.split(f"{folder}/")[1]: line.split()[0] for line in out.splitlines()}
     assert found == {
-        "cut.binary: truncated, 34,992,011 bytes instead of 34,992,012; copy it again": "FAULT",
+        "cut.binary: truncated, 34,992,011 bytes instead of 34,992,012; copy the file again": "FAULT",
         "empty.bsdf: empty; RGL's materials are files that end in _rgb.bsdf": "FAULT",
-        "merl_nbrdf_weights.npz: 7 bytes instead of 256,573; copy it again": "FAULT",
-        "networks.npz: names (1,) and weights (1, 3) are not (n,) and (n, 675); copy it again": "FAULT",
-        "paper_white_rgb.bsdf: 658,927 bytes instead of 658,928; copy it again": "FAULT",
+        "merl_nbrdf_weights.npz: 7 bytes instead of 256,573; copy the file again": "FAULT",
+        "networks.npz: names (1,) and weights (1, 3) are not (n,) and (n, 675); copy the file again": "FAULT",
+        "paper_white_rgb.bsdf: 658,927 bytes instead of 658,928; copy the file again": "FAULT",
         "sub/mine_rgb.bsdf: sound; its checksum is not known here": "ok",
         "sub/paper_white_rgb.bsdf: sound, but not the original file: its SHA-256 differs": "FAULT",
         "uniform.binary: sound; its checksum is not known here": "ok",

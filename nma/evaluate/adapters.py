@@ -74,7 +74,7 @@ def tabulate_adapter(
 
 
 def table_log_loss(adapter: Adapter, params: NDArray, table: NDArray, directions: int | None = None) -> float:
-    """The log loss (eq. 7) of the adapter at one material, whose parameters are `params` (columns,), against `table`.
+    """The log loss (eq. 7) of the adapter against `table`, for one material with the parameters `params` (columns,).
 
     The adapter is integrated only once, so this function is faster than `evaluate`.
     """

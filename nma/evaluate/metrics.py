@@ -22,8 +22,8 @@ def _normal_means(n: int) -> NDArray[np.float64]:
     return -2.0 * n * np.diff(densities)
 
 
-# `noise_floor` takes these values and their negatives as samples of a standard normal variable. The mean magnitude of
-# these values equals that of a standard normal variable.
+# `noise_floor` takes the values in `_NORMAL` and their negatives as samples of a standard normal variable. The mean of
+# `_NORMAL` equals the mean magnitude of such a variable.
 _NORMAL = _normal_means(16)
 
 FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")

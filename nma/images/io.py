@@ -46,10 +46,10 @@ def as_image(image: ArrayLike, name: str = "image") -> NDArray[np.float32]:
 def tonemap(image: ArrayLike, *, exposure: float = 0.0, shoulder: float = 1.0) -> NDArray[np.float32]:
     """Converts linear sRGB radiance to display values (..., 3) in 0..1.
 
-    Let x = 2^exposure * radiance and s = `shoulder`. The function first compresses x: a value up to s stays as it is,
-    and a larger value becomes s + (1 - s) (1 - exp(-(x - s) / (1 - s))), which has slope 1 at s and approaches 1. Then
-    the function applies the sRGB transfer curve (IEC 61966-2-1). Each channel is converted by itself, so very bright
-    colours become white. With `shoulder` = 1, values above 1 are clipped, as error metrics require.
+    Let x = 2^exposure * radiance and s = `shoulder`. The function first compresses x. A value of x up to s stays as it
+    is. A larger value becomes s + (1 - s) (1 - exp(-(x - s) / (1 - s))), which has slope 1 at s and approaches 1 for
+    large x. Then the function applies the sRGB transfer curve (IEC 61966-2-1). Each channel is converted by itself, so
+    very bright colours become white. With `shoulder` = 1, values above 1 are clipped, as error metrics require.
 
     Args:
         image: linear sRGB (..., 3); negative values become 0.

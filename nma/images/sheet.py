@@ -116,7 +116,9 @@ def _common_size(pictures: list[list[NDArray[np.uint8]]], columns: Sequence[str]
         raise ImageError(f"contact_sheet: {len(columns)} columns, but the rows hold {counts} images")
     sizes = {image.shape[:2] for row in pictures for image in row}
     if len(sizes) > 1:
-        raise ImageError(f"contact_sheet: images of different sizes {sorted(sizes)}; render all at one size")
+        raise ImageError(
+            f"contact_sheet: the images have different sizes {sorted(sizes)}; render all images at one size"
+        )
     return sizes.pop()
 
 

@@ -266,7 +266,7 @@ def _channel(given: Mapping[str, Any], param: Param, where: str) -> str | None:
         )
     if param.size > 1:
         raise MaterialError(
-            f"{where}: a channel is for parameters of one number, but {param.name} has {param.size}"
+            f"{where}: a channel is for parameters of one number, but {param.name} has {param.size} numbers"
         )
     return channel
 

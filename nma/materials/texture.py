@@ -53,7 +53,7 @@ class Texture:
     def _pixels(self) -> NDArray[np.float32]:
         """The image's pixels (height, width, channels), linear unless `raw`.
 
-        A parameter of one number has one channel.
+        For a parameter of one number, the result has one channel.
         """
 
         bitmap = _bitmap(self.path)

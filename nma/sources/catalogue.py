@@ -66,7 +66,7 @@ def _check_file(path: Path) -> Finding:
     label = form.name
     found = path.stat().st_size
     if size and found != size:
-        return Finding(path, label, False, f"{found:,} bytes instead of {size:,}; copy it again")
+        return Finding(path, label, False, f"{found:,} bytes instead of {size:,}; copy the file again")
     try:
         label = form.identify(path)
     except SourceError as e:

@@ -33,12 +33,12 @@ from nma.ops import Color, Float, Mask, Vec3
 from nma.sources.base import Random, Walk, throughput
 from nma.sources.layered import Layered3, Stack
 
-# If the coat's index of refraction is closer to 1 than this, single precision cannot represent the refraction, so
+# If the coat's index of refraction is below 1 + `INDEX_MATCHED`, single precision cannot represent the refraction, so
 # `settle` sets the index to 1.
 INDEX_MATCHED = 1e-3
 _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
-# The least weight of the cosine lobe in `lobes`, before the weights are normalised. This lobe covers the directions
-# that the other two lobes leave out.
+# The least weight of the cosine lobe in `lobes`, before the weights are normalised. The cosine lobe covers the
+# directions that the other two lobes leave out.
 LEAST_DIFFUSE = 0.03
 
 
@@ -129,7 +129,7 @@ class _Detour:
 def _unscattered(
     stack: Stack, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
 ) -> tuple[Color, tuple[Vec3, Color]]:
-    """Light from wi to wo that meets interfaces only, and one segment of the walk `there`, chosen by `_Detour`.
+    """Estimates light from wi to wo that meets interfaces only; `_Detour` chooses one segment of the walk `there`.
 
     A path enters through the coat, hits the conductor once or more, and leaves through the coat. The path is sampled
     from both ends, wi and wo. All events of the path are drawn at random except one, the connection, at which the two
@@ -150,7 +150,7 @@ def _unscattered(
     def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
         """Light that a hit of the conductor sends to wo, and the bluntness of the walk's first hit.
 
-        `first` is 0 before the first hit, and then the bluntness of the first hit.
+        `first` is 0 before the first hit, and then the bluntness (reciprocal density) of the first hit.
         """
         w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
         rest = way_in + first
@@ -187,11 +187,11 @@ def _unscattered(
 
 
 def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
-    """Light that scatters in the medium. Every scattering vertex of the walk is connected to each exit path in `ways`.
+    """Estimates the light that scatters in the medium.
 
-    An exit path is given by one segment, with direction and throughput, of a walk from wo that met interfaces only. The
-    medium scatters into all directions, so the connection transports light however narrow the lobes of the exit path
-    are.
+    Every scattering vertex of the walk is connected to each exit path in `ways`. An exit path is one segment, given by
+    direction and throughput, of a walk from wo that met interfaces only. The medium scatters into all directions, so
+    the connection transports light however narrow the lobes of the exit path are.
     """
     source = Layered3()
 
@@ -234,9 +234,10 @@ def _conductor_weight(stack: Stack, w_in: Vec3, up: Vec3) -> Color:
 def _out_through_coat(stack: Stack, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
     """The density q of refraction into the coat, and a factor t for refraction out of the coat.
 
-    q [1/sr] is the density of `up` when light from wo is refracted down at a visible normal. q t is the density of wo
-    when light along `up` is refracted out. In the quotient t of the two densities, the microfacet distribution and the
-    Jacobian cancel. The half vector is that of Walter 2007, eq. 16, and the Jacobian that of eq. 17.
+    q [1/sr] is the density of `up` when light from wo is refracted down at a visible normal. The product of q and t is
+    the density of wo when light along `up` is refracted out. In the quotient t of the two densities, the microfacet
+    distribution and the Jacobian cancel. The half vector is that of Walter 2007, eq. 16, and the Jacobian that of eq.
+    17.
     """
     alpha, eta = stack.alpha_top, stack.eta_top
     matched = eta == 1.0
@@ -278,7 +279,7 @@ def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     crossing = stack.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
     width2 = stack.alpha_bottom * stack.alpha_bottom + 2.0 * crossing * crossing
     # Beyond the critical angle, the coat reflects light of the conductor's lobe back down. Such light may later leave
-    # in any direction, so its share goes to the cosine lobe.
+    # in any direction, so it increases the weight of the cosine lobe.
     critical = 1.0 / (eta + ops.safe_sqrt(eta * eta - 1.0))
     trapped = width2 / (width2 + critical * critical)
     metal = _mean(fresnel_conductor_rgb(cos_t, Color(*stack.eta_bottom), Color(*stack.k_bottom)))

@@ -34,8 +34,8 @@ SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
 # The size of every file in bytes.
 BYTES = 12 + 3 * 8 * math.prod(SHAPE)
 
-# `Merl.of` marks an entry as not measured if the cosine of either direction is smaller than this, because the division
-# of f cos(theta_o) by cos(theta_o) would lose too many digits.
+# `Merl.of` marks an entry as not measured if the cosine of either direction is smaller than `_MIN_COS`, because the
+# division of f cos(theta_o) by cos(theta_o) would lose too many digits.
 _MIN_COS = 1e-4
 _NO_DATA = -1.0
 
@@ -131,13 +131,13 @@ def _brdf(values: Values, wi: Vec3, wo: Vec3) -> NDArray[np.float32]:
 def _check_size(path: Path, content: bytes) -> None:
     """Raises `SourceError` if the file is too short or too long, or has other dimensions."""
     if len(content) < 12:
-        raise SourceError(f"{path}: {len(content)} bytes are too short for a MERL file; copy it again")
+        raise SourceError(f"{path}: {len(content)} bytes are too short for a MERL file; copy the file again")
     shape = tuple(np.frombuffer(content, "<i4", 3).tolist())
     if shape != SHAPE:
         raise SourceError(f"{path}: its dimensions are {shape}, but those of a MERL file are {SHAPE}")
     if len(content) != BYTES:
         what = "truncated" if len(content) < BYTES else "too long"
-        raise SourceError(f"{path}: {what}, {len(content):,} bytes instead of {BYTES:,}; copy it again")
+        raise SourceError(f"{path}: {what}, {len(content):,} bytes instead of {BYTES:,}; copy the file again")
 
 
 def _identify(path: Path) -> str:

@@ -26,7 +26,7 @@ from nma.sources.files import Format
 # rounding errors.
 _PAIRS = 512
 _ROUNDING = 1e-3
-# A direction whose cosine is smaller than this is raised to this cosine. The reason: for two opposite directions at the
+# A direction whose cosine is below `_MIN_COS` is raised to this cosine. The reason: for two opposite directions at the
 # horizon, single precision cannot represent the half vector, and Mitsuba's measured and rough BSDFs return NaN.
 _MIN_COS = 1e-6
 
@@ -160,7 +160,7 @@ def choose_variant() -> Any:
     """The module `mitsuba` in a vectorised RGB variant. If no variant is set, sets the variant of Dr.Jit's backend."""
     import mitsuba
 
-    mi: Any = mitsuba  # its types change with the variant
+    mi: Any = mitsuba  # Any, because Mitsuba's types change with the variant
     if mi.variant() is None:
         mi.set_variant("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb")
     if not mi.variant().endswith("_ad_rgb"):
@@ -180,7 +180,7 @@ def _made(load: Callable[[Any], Any], name: str, options: Mapping[str, Any]) -> 
         raise SourceError(f"{name}: {one_line(str(e))}") from None
     if not isinstance(bsdf, mi.BSDF):
         found = type(bsdf).__name__
-        raise SourceError(f"{name}: holds a {found}, not a BSDF; its outermost element must be <bsdf>")
+        raise SourceError(f"{name}: holds a {found}, not a BSDF; the outermost element must be <bsdf>")
     return MitsubaBsdf(bsdf, name, **options)
 
 

@@ -27,8 +27,8 @@ from nma.sources.half_difference import half_difference
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# The names of the two published sets of networks. Each name is stored under a material that only that set contains, so
-# a weights file with this material belongs to the set.
+# The names of the two published sets of networks, each under a material that only one set contains. A weights file with
+# such a material belongs to the set.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
@@ -87,16 +87,17 @@ def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
             names, weights = f["names"], f["weights"]
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; `nma data` says where to get NBRDF networks") from None
-    except Exception as e:  # zipfile and zlib raise their own exceptions for damaged archives
+    except Exception as e:  # any, since zipfile and zlib raise their own exceptions for damaged archives
         raise SourceError(
             f"{path}: not a weights file of NBRDF networks (.npz with names and weights): {e}"
         ) from None
     if names.dtype.kind != "U" or names.ndim != 1 or weights.shape != (len(names), WEIGHTS):
         raise SourceError(
-            f"{path}: names {names.shape} and weights {weights.shape} are not (n,) and (n, {WEIGHTS}); copy it again"
+            f"{path}: names {names.shape} and weights {weights.shape} are not (n,) and (n, {WEIGHTS}); "
+            "copy the file again"
         )
     if weights.dtype.kind != "f" or not np.isfinite(weights).all():
-        raise SourceError(f"{path}: some weights are not finite numbers; copy it again")
+        raise SourceError(f"{path}: some weights are not finite numbers; copy the file again")
     return names.tolist(), weights.astype(np.float32)
 
 
@@ -113,7 +114,7 @@ def _claims(path: Path) -> bool:
     try:
         with arrays(path) as f:
             return "weights" in f
-    except Exception:  # zipfile raises its own exceptions for damaged archives
+    except Exception:  # any, since zipfile raises its own exceptions for damaged archives
         return False
 
 

@@ -82,7 +82,7 @@ def read_tensors(path: str | Path) -> dict[str, NDArray]:
     try:
         return _parse(content)
     except (struct.error, ValueError) as e:
-        raise SourceError(f"{path}: truncated or damaged ({e}); copy it again") from None
+        raise SourceError(f"{path}: truncated or damaged ({e}); copy the file again") from None
 
 
 def _parse(content: bytes) -> dict[str, NDArray]:

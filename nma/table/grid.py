@@ -73,7 +73,7 @@ class Tables:
     `params` (n, columns) are the parameters of the materials, and `values` (n, *grid.shape) are their tables. `walks`
     (n,) has the number of random walks of each material. `error` has the standard error of each value, or is None.
     `class_name` is the class of all materials. If `class_name` is not given, it is the only class whose parameters have
-    as many columns as `params`. Raises `TableError` if no class, or more than one class, has as many columns.
+    as many columns as `params`. Raises `TableError` if no class, or more than one class, has this number of columns.
     """
 
     params: NDArray[np.float64]
@@ -132,7 +132,7 @@ class Tables:
             raise TableError(f"{e}; use the version that made the tables") from None
 
     def save(self, path: str | Path) -> None:
-        """Writes a reference file (its format is in CONVENTIONS.md), atomically."""
+        """Writes a reference file, atomically. CONVENTIONS.md describes the file format."""
         arrays: dict[str, Any] = {"class": self.class_name, "params": self.params}
         arrays |= {"table": self.values, "walks": self.walks}
         if self.error is not None:
@@ -155,7 +155,7 @@ class Tables:
             raise TableError(
                 f"{path}: not a reference file (.npz with the arrays params, table and walks): {e}"
             ) from None
-        except Exception as e:  # zipfile and zlib raise their own exceptions for damaged archives
+        except Exception as e:  # any, since zipfile and zlib raise their own exceptions for damaged archives
             raise TableError(f"{path}: damaged archive: {e}") from None
         _check_arrays(path, params, values, walks, error)
         walks = np.broadcast_to(walks, len(params)).astype(np.int64)
@@ -202,7 +202,7 @@ def class_entry(arrays: Any) -> str:
 def _class_with(columns: int) -> str:
     """The class whose parameter vectors have `columns` columns.
 
-    Raises `TableError` if not exactly one class has as many.
+    Raises `TableError` if no class, or more than one class, has this number of columns.
     """
     sizes = {name: sources.space(name).size for name in sources.classes()}
     fitting = [name for name, size in sizes.items() if size == columns]

@@ -33,13 +33,13 @@ _REACH = 4.5
 
 # A bin's points are divided into this many independent sets. The spread of the sets' means gives the standard error.
 _SETS = 4
-# The number of points must be a multiple of this. Then all sets have equally many points, and the points of each set
-# form equally many pairs in both mirror halves of a bin.
+# The number of points must be a multiple of `_MULTIPLE`, so that all sets have equally many points, and the points of
+# each set form equally many pairs in both mirror halves of a bin.
 _MULTIPLE = 16
 # Points stay this fraction of a bin's width away from its edges, so that rounding moves no point into the next bin.
 _EDGE = 1e-5
 
-# If the variance of the weights is smaller than this, the weights count as equal, because only rounding makes them
+# If the variance of the weights is below `_UNWEIGHTED`, the weights count as equal, because only rounding makes them
 # differ.
 _UNWEIGHTED = 1e-4
 
@@ -187,9 +187,9 @@ def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:
 class TableValues:
     """A table as a source (`Values`): every pair of directions has the value of its bin.
 
-    `tabulate_values` of this source gives the same table again. With `smooth`, values are interpolated linearly between
-    the middles of the bins. Interpolation avoids steps in rendered images, but it widens peaks and changes the means
-    over bins.
+    `tabulate_values` of such a source gives the same table again. With `smooth`, values are interpolated linearly
+    between the middles of the bins. Interpolation avoids steps in rendered images, but it widens peaks and changes the
+    means over bins.
     """
 
     def __init__(self, tables: Tables, number: int = 0, *, name: str = "table", smooth: bool = False):

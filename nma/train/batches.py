@@ -123,8 +123,8 @@ class BinSampler:
         steps = np.arange(grid.theta_o)
         near_o = 1.0 / (1.0 + ((steps[None, :] - steps[:, None]) / 1.5) ** 2)
         self._o = near_o / near_o.sum(axis=1, keepdims=True)
-        # Distance in bins from the azimuth of the mirror direction. In isotropic tables, whose azimuths are folded,
-        # this azimuth is in the last bin. Anisotropic tables have bins on both sides of this azimuth.
+        # Distance in bins from the azimuth of the mirror direction. In isotropic tables, whose azimuths are folded, the
+        # mirror direction is in the last bin. Anisotropic tables have bins on both sides of the mirror direction.
         steps = np.arange(grid.phi_o)
         steps = np.minimum(steps, grid.phi_o - steps) if grid.phi_i else grid.phi_o - 1 - steps
         near_p = 1.0 / (1.0 + (steps / 1.5) ** 2)
@@ -209,7 +209,7 @@ def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> 
                 if stopped.is_set():
                     return
             queue.put(None)
-        except BaseException as e:  # passed to the consumer, which raises it
+        except BaseException as e:  # the exception is passed to the consumer, which raises it
             queue.put(e)
 
     thread = threading.Thread(target=produce, daemon=True)

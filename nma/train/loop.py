@@ -31,7 +31,7 @@ Objective = Callable[[Weights, Batch, Recipe], tuple[jax.Array, jax.Array]]
 # Number of steps per call of the compiled function (a group).
 GROUP = 50
 _CHECKPOINT_SECONDS = 60.0
-# The schedule "plateau" compares the mean losses of two successive windows. A window has this many groups.
+# The schedule "plateau" compares the mean losses of two successive windows. A window has `_PATIENCE` groups.
 _PATIENCE = 6
 _MIN_SCALE = 1e-3
 

@@ -95,8 +95,8 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     """The squared error of the directional albedo, times its weight in the recipe."""
     if not recipe.albedo > 0:
         return 0.0
-    # The two estimates are independent. Therefore the mean of the product of their errors is the squared error, without
-    # the variance of the estimates.
+    # The two estimates are independent, so the mean of the product of their errors is the squared error, without the
+    # variance of the estimates.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 

@@ -91,7 +91,7 @@ class PointPool:
         """The points of one step: random rows, and random points of each row."""
         rng = np.random.default_rng((recipe.seed, step, 0x90))
         m = rng.integers(len(self.mu), size=recipe.rows)
-        # The points of a row are consecutive, so that every _CROWDED-th of them is near the mirror direction.
+        # The points of a row are consecutive, so that every _CROWDED-th point is near the mirror direction.
         count = recipe.bins_per_row * recipe.points
         k = (
             rng.integers(self.weight.shape[1], size=recipe.rows) + np.arange(count)[:, None]
