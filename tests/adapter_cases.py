@@ -36,7 +36,7 @@ def random_adapter(
 
 
 def random_anisotropic_adapter(hidden="3x32", seed=0):
-    """Returns an untrained adapter of a single material whose appearance changes with the azimuth of the view."""
+    """Returns an untrained adapter of a single material that is anisotropic."""
     about = {"name": "azimuth", "params": ANISOTROPIC_PARAMS, "space": MEASURED}
     return random_adapter(hidden=hidden, seed=seed, **about)
 

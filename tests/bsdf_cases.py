@@ -1,4 +1,4 @@
-"""Helpers for the tests of BSDFs: a texture with one special pixel, and the error for a faulty description."""
+"""Helpers for the tests of BSDFs: a texture with one special pixel, and the error message for a faulty BSDF."""
 
 import mitsuba as mi
 import numpy as np
@@ -8,7 +8,7 @@ from nma.render.textures import bitmap_texture
 
 
 def load_error(description):
-    """Returns the error message with which `mi.load_dict` refuses a description."""
+    """Returns the error message with which `mi.load_dict` refuses the description of a BSDF."""
     with pytest.raises(RuntimeError) as e:
         mi.load_dict(description)
     return str(e.value)

@@ -38,8 +38,8 @@ Vec view(int row, int rows, layered::Random& random) {
     return {nma::safe_sqrt(1.0f - z * z), 0.0f, z};
 }
 
-// Samples a direction from the density, and returns it as a walk whose throughput is an estimate of the value divided
-// by the density.
+// Samples a direction from the density. Returns a walk with this direction, whose throughput is an estimate of the
+// value divided by the density.
 layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Random& random) {
     const layered::Density density(stack, wi);
     const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
@@ -65,8 +65,8 @@ void layered_pdf_each(int n, const float* parameters, const float* wi, const flo
     for (int i = 0; i < n; ++i) layered_pdf(1, parameters + COLUMNS * i, wi + 3 * i, wo + 3 * i, pdf + i);
 }
 
-// `u` has rows of three uniform random numbers. Each row of `out` gets seven numbers: the three of wo, the density of
-// wo, and the three channels of an estimate of the value.
+// `u` has rows of three uniform random numbers. Each row of `out` gets seven numbers: the three components of wo, the
+// density of wo, and the three channels of an estimate of the value.
 void layered_sample(int n, const float* parameters, const float* wi, const float* u, float* out) {
     const auto stack = layered::Stack::of(parameters);
     const layered::Density density(stack, vec(wi));

@@ -68,12 +68,13 @@ def table_of(sums, squares, per_row):
 def z_scores(found, error, walks, factor=1.0, known=np.inf):
     """Returns the z-scores of `factor` times `found` minus the table `walks`.
 
-    There is a score for each row, and for each bin with over 100 walks and with a relative error below `known`.
+    There is a score for each row, and for each bin with over 100 walks and with a relative standard error below
+    `known`.
     """
     enough = found * GRID.solid_angle * walks.walks[0] / GRID.theta_i > 100
     enough &= error < known * found
     difference, variance = factor * found - walks.values[0], error**2 + walks.error[0].astype(np.float64) ** 2
-    # A walk ends in one bin only, so bins are negatively correlated. The sum of the variances of the bins is therefore
-    # an upper bound of the variance of the row.
+    # A walk ends in one bin only, so the values of two bins are negatively correlated. The sum of the variances of the
+    # bins is therefore an upper bound of the variance of the row.
     rows = difference.sum(axis=(1, 2)) / np.sqrt(variance.sum(axis=(1, 2)))
     return np.concatenate([difference[enough] / np.sqrt(variance[enough]), rows.ravel()])

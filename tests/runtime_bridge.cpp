@@ -1,5 +1,5 @@
-// The functions that tests of the runtime call in addition to the C interface. The functions evaluate the target on
-// arrays, in float and in double, and copy the parameters of a BRDF's instances to an array.
+// These functions extend the C interface for the tests of the runtime. The functions evaluate the target on arrays, in
+// float and in double, and copy the parameters of a BRDF's blend to an array.
 #include "nma.h"
 #include "nma_c.h"
 
@@ -7,8 +7,8 @@ namespace {
 
 constexpr int PRINCIPLED_SIZE = nma::Blend<float>::PRINCIPLED_SIZE;
 
-// Makes a blend from an array: the fields of the first instance in the order of `Principled`, the fields of the second
-// instance, and so on, and then the weights of all instances.
+// Makes a blend of `Principled` instances from an array. The array holds the fields of the first instance in the order
+// of `Principled`, the fields of the second instance, and so on, and then the weights of all instances.
 template <class T>
 nma::Blend<T> blend_of(const T* numbers, int count) {
     nma::Blend<T> made(count);

@@ -19,10 +19,12 @@ FAST_COMPILE = {
 def random_principled(
     rng: np.random.Generator, n: int, dialect: bool = True, fades: bool = False
 ) -> Principled:
-    """Returns n random parameter sets. The roughness spreads over decades, and many parameters are exactly 0 or 1.
+    """Returns n random parameter sets.
 
-    With `dialect`, the parameters that the paper leaves out are not 0. With `fades`, the parameters that Mitsuba's
-    BSDF does not have are random too.
+    The roughness is log-uniform from .03 to 1, and many parameters are exactly 0 or 1.
+
+    With `dialect`, `anisotropic` and `flatness` are random too, which the targets of the paper do not have. With
+    `fades`, `fade` and `fade_width` are random too, which Mitsuba's BSDF `principled` does not have.
     """
 
     def often_pure():
@@ -52,7 +54,7 @@ def _fades(rng: np.random.Generator, n: int) -> dict:
 def random_blend(
     rng: np.random.Generator, n: int, n_instances: int, dialect: bool = True, fades: bool = False
 ) -> Blend:
-    """Returns n blends of random instances. The weights of each blend are random and sum to one."""
+    """Returns n blends of `n_instances` random instances. The weights of each blend are random and sum to one."""
     weights = rng.dirichlet(np.ones(n_instances), n).T
     return Blend(tuple(random_principled(rng, n, dialect, fades) for _ in range(n_instances)), tuple(weights))
 

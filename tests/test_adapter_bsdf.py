@@ -68,7 +68,7 @@ def description(weights, **changes):
 
 
 def textured(weights, **changes):
-    """Returns a description of the same material as `description` does, but gives three parameters as textures.
+    """Describes the same material as `description`, but gives three parameters as textures.
 
     Each texture has the same value everywhere.
     """
@@ -97,8 +97,8 @@ def close(a, b, rtol=1e-4, atol=1e-6):
 def test_values_are_those_of_the_adapter(weights, make):
     """The BSDF has the values and densities that NumPy computes from the adapter.
 
-    The mean relative error is below 1e-5 for textured materials. The limit for untextured materials is 2e-4, because
-    an untextured material interpolates the parameters of its target from curves.
+    The mean relative error is below 1e-5 for textured materials. For untextured materials it is only below 2e-4,
+    because an untextured material interpolates the parameters of its target from precomputed curves.
     """
     bsdf, (si, rng) = mi.load_dict(make(weights)), interactions(2000)
     wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
@@ -118,7 +118,11 @@ def test_values_are_those_of_the_adapter(weights, make):
 
 @pytest.mark.parametrize(("instances", "directional"), VARIANTS.values(), ids=VARIANTS)
 def test_every_variant_of_adapters_has_the_values_of_numpy(tmp_path, instances, directional):
-    """The BSDF equals NumPy within 1 % for every number of instances, with and without dependence on the direction."""
+    """The values of the BSDF and of the adapter in NumPy agree within 1 %.
+
+    The test covers adapters with several counts of instances, whose parameters depend on the view direction or are
+    constant.
+    """
     random_adapter(instances, directional, hidden="1x4").save(tmp_path / "w.safetensors")
     adapter, (si, rng) = Adapter.load(tmp_path / "w.safetensors"), interactions(500)
     wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
@@ -243,9 +247,10 @@ def scene(bsdf, name="material", **integrator):
 
 
 def test_pictures_by_curves_network_and_wavefront_are_equal(weights):
-    """A material renders the same picture from curves as from the network, up to rounding.
+    """Target parameters from precomputed curves and from the network give the same picture, up to rounding.
 
-    Pictures with evaluated loops also equal pictures with symbolic loops. All pictures use the same random numbers.
+    Pictures with Dr.Jit's evaluated loops also equal pictures with symbolic loops. All pictures use the same random
+    numbers.
     """
     curves = np.array(mi.render(scene(description(weights)), spp=16, seed=1))
     loaded = scene(textured(weights))

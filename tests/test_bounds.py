@@ -149,7 +149,7 @@ def give(tmp_path, adapter, material_file, nma):
 def beyond(kind, steps):
     """Yields (name, value) with values that lie `steps` tolerances beyond the lower or the upper bound.
 
-    Only one channel of a colour lies beyond its bound.
+    If the parameter is a colour, only one of its channels lies beyond its bound.
     """
     for name in NAMES:
         low, high = LAYERED3[name].bounds(kind)

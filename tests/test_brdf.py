@@ -201,7 +201,10 @@ def test_an_anisotropic_adapter_has_no_curves():
 
 
 def test_a_cosine_in_place_of_the_direction_is_refused():
-    """`prepare` took cosines in older versions. The error message for a cosine says how to make a direction."""
+    """If `prepare` gets a cosine, the error message says how to make a direction.
+
+    In older versions, `prepare` took cosines.
+    """
     adapter = Adapter.load("layered3-3x32")
     columns = list(LAYERED3.sample(np.random.default_rng(0), 2).T)
     for cosine in (0.5, np.array([0.5, 0.6]), mi.Float(0.5)):

@@ -26,7 +26,7 @@ def test_every_command_has_a_file_of_its_name():
     for words, function in commands():
         file = function.__module__.removeprefix("nma.cli.")
         assert file in cli.COMMANDS
-        assert file in words[0].split("-")  # for example, `train-library` is in library.py
+        assert file in words[0].split("-")  # for example, the code of `nma train-library` is in library.py
 
 
 def test_help_and_version_import_no_slow_package():

@@ -18,7 +18,7 @@ TEXTURED = (
 
 @pytest.fixture
 def textured(tmp_path):
-    """The path of a material file, one of whose parameters is a channel of a packed image."""
+    """The path of a material file in which one parameter is a channel of a packed image."""
     Image.fromarray(np.full((4, 4, 3), (255, 25, 0), np.uint8)).save(tmp_path / "orm.png")
     (tmp_path / "worn.toml").write_text(TEXTURED)
     return tmp_path / "worn.toml"

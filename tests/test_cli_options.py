@@ -96,7 +96,7 @@ def test_an_output_must_have_the_ending_of_its_format(nma, tmp_path, monkeypatch
 
 
 def test_the_longest_ending_of_a_name_counts():
-    """A second renderer can have an ending of its own for JSON files, which do not go to the first renderer then."""
+    """A file whose name ends in .blend.json has the format of this ending, not the format of .json."""
     endings = (".xml", ".json", ".blend.json")
     for name, found in (
         ("a.json", ".json"),

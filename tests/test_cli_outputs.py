@@ -20,7 +20,7 @@ FUNCTIONS = dict(commands())
 
 
 def arguments(words, output):
-    """Returns the words of a command that writes `output`.
+    """Returns the command-line words of a command that writes `output`.
 
     The input files do not exist, because the command must refuse a bad output before it reads any input.
     """

@@ -52,10 +52,10 @@ def test_a_damaged_part_is_simulated_again(nma, tmp_path):
 
 
 def test_a_run_survives_if_another_run_removes_its_parts(nma, tmp_path, monkeypatch):
-    """Two runs write the same output, and the first run removes the folder of parts before the second run needs it.
+    """Two runs write the same output, and the first run removes the temporary folder that the second run still uses.
 
-    The folder of parts vanishes just before the second run renames a part. A failure means that the second run stops
-    with an error.
+    The temporary folder holds the finished parts of the output. The test removes the folder just before the second run
+    renames a part. A failure means that the second run stops with an error.
     """
     replace, taken = Path.replace, []
 

@@ -180,7 +180,7 @@ def measured(scene, names):
 
 
 def scores(found, bsdfs):
-    """Returns how many standard deviations each composite differs from the weighted sum of its parts.
+    """Returns by how many standard deviations each composite differs from the weighted sum of its parts.
 
     The result is a dictionary from the names of cells to arrays (channels,).
     """
@@ -210,7 +210,8 @@ def test_composites_are_linear_combinations(bsdfs, integrator):
     assert not off, (limit, off)
     if integrator == "direct, lights":
         return  # with light sampling alone, pictures of narrow lobes are too noisy for the next check
-    # A bias of 3 % would exceed the limit, in the median over the cells of single BSDFs and their colour channels.
+    # A bias of 3 % would be detected: in the median over single BSDFs and colour channels, 3 % of the mean is more than
+    # `limit` standard errors.
     seen = [(0.03 * m / np.sqrt(v + 1e-14))[:3] for m, v in (found[name] for name in bsdfs)]
     assert np.median(seen) > limit
 
@@ -221,7 +222,7 @@ def test_composites_render_in_the_integrator_direct(bsdfs, name):
 
     Unlike a path tracer, `direct` evaluates and samples a BSDF in separate calls.
 
-    Only the slow test `test_composites_are_linear_combinations` compares the values of pictures.
+    The slow test `test_composites_are_linear_combinations` also compares the values of the pictures.
     """
     sheet = {"mask": mask(bsdfs[name]), "blend": blend(bsdfs[name])}
     picture = np.array(mi.render(sheet_scene(sheet, INTEGRATORS["direct"]), spp=4))

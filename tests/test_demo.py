@@ -29,7 +29,7 @@ def test_the_sheet_is_written_before_any_measurement_and_again_with_figures(tmp_
     assert (first[0], second[0]) == ("plain, first pictures", "textured, first pictures")
     assert measured == ["measured"] * 3 and plain[0] == "plain, with figures"
     assert events[-1][0] == "textured, with figures"
-    # The sheet has four different heights: first rows of pictures are added, and then lines of the table below them.
+    # The sheet grows three times, because rows of pictures and lines of the table below them are added.
     heights = [event[1] for event in events if event != "measured"]
     assert heights == sorted(heights) and len(set(heights)) == 4
     assert sum(samples) == total_samples(settings)

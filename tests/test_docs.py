@@ -28,7 +28,10 @@ MEASURED = "paper_white_rgb.bsdf"
 
 
 def blocks(language):
-    """Returns all code blocks in a language, by keys of page and index, such as docs/python.md-0."""
+    """Returns all code blocks in a language, as a dictionary.
+
+    The keys are page and index, such as docs/python.md-0.
+    """
     return {
         f"{page.relative_to(ROOT)}-{number}": block
         for page in PAGES

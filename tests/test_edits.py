@@ -131,7 +131,10 @@ def test_loading_many_materials_leaves_memory_flat():
 
 @pytest.mark.parametrize("kind", [*BESIDE, "blendbsdf"])
 def test_frozen_functions_render_edited_values(adapter, kind):
-    """A frozen function shows edits that were made before its call or by itself, and is recorded at most twice."""
+    """A frozen function renders edits made before its call, and edits that the function makes.
+
+    The function is recorded at most twice.
+    """
     blend = {"type": "blendbsdf", "weight": 0.3, "a": adapter | {"alpha_bottom": TEXTURE}, "b": LAYERED}
     loaded = scene(blend if kind == "blendbsdf" else BESIDE[kind](adapter))
     params = mi.traverse(loaded)
@@ -158,10 +161,10 @@ def test_frozen_functions_render_edited_values(adapter, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ("plain", "textured"))
 def test_frozen_functions_see_derivatives_of_numbers_set_before(adapter, kind):
-    """A frozen function and the same function without `dr.freeze` return equal derivatives by `sigma_t`, within 2 %.
+    """With and without `dr.freeze`, a function returns equal derivatives with respect to `sigma_t`, within 2 %.
 
-    `sigma_t` is set before the function is called. The curves of an untextured material are also computed before the
-    call, so that the frozen function receives both `sigma_t` and the curves.
+    `sigma_t` is set before the function is called. An untextured material precomputes curves of its target parameters,
+    also before the call, so that the frozen function receives both `sigma_t` and the curves.
     """
 
     def derive(loaded, params):
@@ -337,7 +340,7 @@ def test_shared_constants_have_gradients(adapter):
 @pytest.mark.parametrize("clamp", (False, True))
 @pytest.mark.parametrize("textured", (False, True))
 def test_values_on_a_bound_have_gradients(adapter, clamp, textured):
-    """The derivative by a parameter on its lower bound is the derivative just above the bound, within 5 %.
+    """The derivative with respect to a parameter is the same on the parameter's lower bound and just above, within 5 %.
 
     A failure means that an optimisation cannot change black texels.
     """

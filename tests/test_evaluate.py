@@ -1,4 +1,4 @@
-"""Evaluation: figures of merit follow their formulas, and tables of adapters agree with far finer integration."""
+"""Evaluation: figures of merit follow their formulas, and tables of adapters agree with a much finer integration."""
 
 import json
 import math
@@ -105,10 +105,10 @@ def elsewhere(n):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slope"), [*((name, 1.0) for name in BLENDS), ("alpha .001", 0.0)])
 def test_the_stated_error_of_integration_covers_the_actual_error(name, slope):
-    """The log loss of the mean of two tables is at most 1.6 times the log loss that an evaluation states, plus 3e-5.
+    """The integration error of an adapter's table is at most 1.6 times the error that an evaluation states, plus 3e-5.
 
-    The log loss is measured against fine integration, around the mirror direction and elsewhere. A failure means that
-    an evaluation claims more accuracy than it has.
+    The integration error is the log loss between the mean of two tables and a finer integration, around the mirror
+    direction and elsewhere. A failure means that an evaluation claims more accuracy than it has.
     """
     adapter = constant(BLENDS[name], slope)
     first, second = halves(name, slope)
@@ -283,8 +283,8 @@ def test_the_noise_floor_is_the_expected_loss_of_a_perfect_model(scale):
 def test_counting_errors_are_exact_for_walks_of_throughput_1():
     """If all walks have throughput 1, the standard deviation of a bin is the value of `counting_error`, within 5 %.
 
-    The count of walks in the bin is binomial, and eq. 9 of the paper converts the count to a value. `counting_error`
-    leaves out the factor sqrt(1 - p) of the binomial, where p is the probability of the bin.
+    The count of walks in a bin is binomial, and eq. 9 of the paper converts the count to the value of the bin.
+    `counting_error` leaves out the factor sqrt(1 - p) of the binomial, where p is the probability of the bin.
     """
     rows, walks, omega = 4, 4_000_000, 2.0 * math.pi / 100
     chance = np.array([0.001, 0.01, 0.05])

@@ -67,7 +67,7 @@ def writes(tree: ast.AST, known: dict[str, str] | None = None) -> Iterator[ast.C
 
 
 def name(node: ast.AST) -> str:
-    """Returns the last part of the name of a called function: `whole` for files.whole(path)."""
+    """Returns the last part of the name of a called function, for example `whole` for the call `files.whole(path)`."""
     return ast.unparse(node.func).rpartition(".")[2] if isinstance(node, ast.Call) else ""
 
 

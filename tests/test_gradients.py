@@ -1,4 +1,4 @@
-"""Derivatives of pictures by the parameters of `nma` equal finite differences, and an optimisation finds a texture."""
+"""Derivatives of pictures with respect to parameters equal finite differences, and optimisation recovers a texture."""
 
 import mitsuba as mi
 import numpy as np
@@ -31,7 +31,8 @@ MATERIAL = {
     "albedo": rgb(0.8, 0.4, 0.3),
     "sigma_t": 0.7,
 }
-# Materials, each with the parameters to differentiate by. For each parameter there is a direction of change.
+# Each material has a dictionary of parameters. The tests compute the derivative with respect to each parameter, along
+# the direction that is given by the array.
 CASES = {
     "plain": (
         MATERIAL,
@@ -76,7 +77,7 @@ def scene(bsdf, depth, sky, beside=None):
 def replaced(params, key, value):
     """Sets a parameter to `value`, converted to the parameter's type.
 
-    Enables derivatives by the parameter and resets their sum to zero.
+    Enables derivatives with respect to the parameter and resets the accumulated derivative to zero.
     """
     kind = type(params[key])
     numbers = np.asarray(value, np.float32)
@@ -85,9 +86,10 @@ def replaced(params, key, value):
 
 
 def slopes(loaded, directions, step, spp, seeds):
-    """Returns the derivatives of a picture's mean along each direction of change, by `prb` and by central differences.
+    """Returns directional derivatives of a picture's mean, by the integrator `prb` and by central differences.
 
-    The derivatives and the differences are dictionaries of arrays (seeds,), with the keys of `directions`.
+    `directions` maps the name of a parameter to a direction in which its values change. Derivatives and differences are
+    dictionaries with the same keys, whose values are arrays (seeds,).
     """
     params = mi.traverse(loaded)
     start = {key: np.array(params[key], np.float64).reshape(d.shape) for key, d in directions.items()}
@@ -118,7 +120,7 @@ def slopes(loaded, directions, step, spp, seeds):
 
 
 def case(name, folder):
-    """Returns the material and the directions of change of one of CASES.
+    """Returns the material of a case in CASES, and the directions in which its parameters change.
 
     The textured material gets a small random adapter, whose derivatives are large.
     """
@@ -166,7 +168,7 @@ def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("blended", (False, True), ids=("alone", "blended"))
 def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
-    """Forward and backward derivatives agree within 1e-3 in a scene of several BSDFs.
+    """Forward-mode and reverse-mode derivatives agree within 1e-3 in a scene of several BSDFs.
 
     Dr.Jit traces each BSDF as a separate function call, and derivatives must propagate into and out of these calls.
     """

@@ -30,7 +30,10 @@ def test_equal_images_have_no_error(picture):
 
 
 def test_plain_errors_follow_their_formulas():
-    """The expected errors are computed by hand for an image of 3, a reference image of 1, and eps = .01."""
+    """The errors equal values that are computed by hand with eps = .01.
+
+    All pixels of the image are 3, and all pixels of the reference image are 1.
+    """
     result = errors(np.full((2, 2, 3), 3.0), np.full((2, 2, 3), 1.0))
     expected = {"l1": 2.0, "l2": 4.0, "mape": 2 / 1.01, "smape": 4 / 4.01, "mrse": 4 / 1.01}
     assert result == pytest.approx(expected, rel=1e-9)
@@ -55,7 +58,7 @@ def test_ssim_sees_noise_rather_than_brightness(picture):
 
 
 def test_ldr_metrics_see_differences_beyond_white_only_at_lower_exposure(picture):
-    """The LDR metric of two pictures is zero if they differ only beyond white, because values beyond white are clipped.
+    """The LDR metric of two pictures is zero if they differ only in values above 1, because these values are clipped.
 
     At a lower exposure, the LDR metric shows the difference.
     """
@@ -145,7 +148,7 @@ def test_exr_keeps_values(tmp_path: Path, picture):
 def test_exr_files_are_written_and_read_with_one_thread(tmp_path: Path):
     """A process with one thread writes and reads an EXR file.
 
-    If this test does not end, OpenEXR waits for a second thread.
+    If this test hangs, OpenEXR is waiting for a second thread.
     """
     program = (
         "import drjit, sys; drjit.set_thread_count(1)\n"

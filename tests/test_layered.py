@@ -59,7 +59,7 @@ def estimates(layers, wi, rng):
 
 
 def evaluated_table(values, per_row, seed):
-    """Returns the means of bins (theta_i, theta_o, phi, 3) from evaluation, and their standard errors."""
+    """Returns the means of bins (theta_i, theta_o, phi, 3) and their standard errors, both from evaluation of f."""
     row = dr.arange(dr.auto.UInt32, GRID.theta_i * per_row) // per_row
     rng = random(dr.width(row), seed)
     layers = layers_of(values, dr.width(row))
@@ -78,7 +78,7 @@ def evaluated_table(values, per_row, seed):
 
 
 def compare(values, seed, factor=1.0):
-    """Returns the z-scores of the difference between evaluation (times `factor`) and walks.
+    """Returns the z-scores of the differences between evaluated means (times `factor`) and means of random walks.
 
     There is a score for each bin with over 100 walks, and for the sum of each row.
     """
@@ -110,7 +110,8 @@ def test_comparison_would_see_two_percent():
 def test_integral_of_rough_coat_over_white_conductor():
     """The albedo at cos(theta_i) = .9 is .556, to three digits.
 
-    In two public programs, evaluation and random walks give different albedos for this rough coat over a conductor.
+    This rough coat over a conductor is a hard case: in two public programs, evaluation and random walks disagree about
+    its albedo.
     """
     n = 1 << 20
     _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), random(n, 5))
@@ -120,7 +121,7 @@ def test_integral_of_rough_coat_over_white_conductor():
 
 @pytest.mark.parametrize("case", CASES)
 def test_reciprocity(case):
-    """f(wi, wo) = f(wo, wi), for pairs of directions away from the mirror direction."""
+    """Swapping wi and wo does not change f, for pairs of directions away from the mirror direction."""
     n = 1 << 15
     layers = layers_of(CASES[case], n)
     for a, b in ((0.9, 0.8), (0.3, 0.95)):
@@ -133,7 +134,7 @@ def test_reciprocity(case):
 
 
 def test_finite_everywhere():
-    """Density and value are finite for random materials of the valid range and for directions near the horizon."""
+    """Density and value are finite for random parameters in the valid range and for directions near the horizon."""
     n, rng = 1 << 15, np.random.default_rng(2)
 
     def spread(low, high, log=False):

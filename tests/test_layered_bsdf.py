@@ -249,7 +249,9 @@ def same_image(a, b):
 
 @pytest.mark.slow
 def test_light_sampling_equals_bsdf_sampling(monkeypatch):
-    """Next-event estimation with MIS renders the same image as BSDF sampling alone (false alarm 3 x 1 %).
+    """Next-event estimation with MIS renders the same image as BSDF sampling alone.
+
+    Three statistical tests each have a false-alarm rate of 1 %.
 
     A failure means that `eval` or `pdf` does not match `sample`. The test detects values that are 3 % too large.
     """
@@ -268,7 +270,10 @@ def test_light_sampling_equals_bsdf_sampling(monkeypatch):
 
 
 def test_white_furnace():
-    """A lossless material under a uniform sky is invisible (false alarm .1 %). A failure means that energy is lost."""
+    """A lossless material under a uniform sky is invisible (false-alarm rate .1 %).
+
+    A failure means that energy is lost.
+    """
     material = {**LACQUER, **WHITE, "alpha_top": 1e-4, "alpha_bottom": 1e-4, "sigma_t": 1.0}
     description = {
         "type": "scene",

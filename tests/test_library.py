@@ -144,7 +144,7 @@ def test_encoding_a_new_material_beats_the_nearest_code(library, tables):
     for (matrix, bias), (before, bias_before) in zip(library.adapter.layers, layers, strict=True):
         np.testing.assert_array_equal(matrix, before)
         np.testing.assert_array_equal(bias, bias_before)
-    # Among the codes of the library, the code of a material fits its table best.
+    # Of all codes in the library, each material's own code fits the table of this material best.
     nearest = [
         np.argmin(training._judge(library.codes, library, tables[k : k + 1], CODING)) for k in range(3)
     ]

@@ -88,7 +88,7 @@ def test_light_from_below_or_to_below_the_surface_is_black():
 
 
 def scene(integrator):
-    """Loads a scene of a plate, seen from above, that a small lamp lights at a grazing angle.
+    """Loads a scene of a plate that is seen from above and lit by a small lamp at a grazing angle.
 
     The picture has 4 x 4 pixels.
     """
@@ -124,22 +124,23 @@ def mean(integrator, spp, runs=8):
 def test_light_tracing_renders_what_path_tracing_does(monkeypatch):
     """The mean colours of both integrators agree within 4.5 standard errors.
 
-    With errors of seven degrees of freedom, about one run in a hundred would be a false alarm; seeds are fixed.
+    The standard errors are estimated from eight runs, so about one test in a hundred would be a false alarm with random
+    seeds; seeds are fixed.
     """
     wanted, doubt = mean("path", 1024)
     found, error = mean("ptracer", 16384)
     assert (error < 0.01 * wanted).all()
     assert (np.abs(found - wanted) < 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
-    # If the adapter is prepared for the direction of the light in place of the view, the colours of the two integrators
-    # differ significantly.
+    # If the adapter gets the light direction in place of the view direction, the colours of the two integrators differ
+    # significantly.
     monkeypatch.setattr(Adapter, "reciprocal", True)
     found, error = mean("ptracer", 16384)
     assert (np.abs(found - wanted) > 4.5 * np.hypot(error, doubt)).all(), (found, wanted)
 
 
 # A program that prints five colours for each random pair of directions. The first three colours are values of f: for a
-# camera path, for a light path, and for a camera path with swapped directions. The last two colours belong to a sample:
-# its weight times its pdf, and the value that `eval_pdf` returns for its direction.
+# camera path, for a light path, and for a camera path with swapped directions. The last two colours belong to a sampled
+# direction: the sample weight times the pdf, and the value that `eval_pdf` returns for this direction.
 SCALAR = """
     rng = np.random.default_rng(0)
     light = mi.BSDFContext(mi.TransportMode.Importance)

@@ -61,7 +61,7 @@ def test_the_studio_leaves_weaker_fireflies_than_outdoors():
 
 
 def test_outdoors_is_the_lighting_of_the_committed_results():
-    """The mean colour of a picture is the same as when the results of benches and figures were committed.
+    """The mean colour of a picture is the same as when the results in `bench/` and `figures/` were committed.
 
     A failure means that the lighting has changed, so that new results cannot be compared with the committed results.
     """
@@ -99,7 +99,7 @@ def test_multijittered_samples_fill_a_grid(spp, pixels, capfd):
 def test_the_command_asks_for_no_sample_count_that_mitsuba_warns_of(capfd):
     """A picture of 128 samples per pixel is rendered in two passes of 64 samples, which fill a grid.
 
-    Mitsuba would print a warning for a pass of 128 samples, because they do not fill a grid.
+    Mitsuba would print a warning for a pass of 128 samples, because 128 samples do not fill a grid.
     """
     view = View((192, 192), 128, 6, "hero", "studio", None, "llvm_ad_rgb")
     assert sampler(128, 192 * 192) == "multijitter"

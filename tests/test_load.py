@@ -35,7 +35,7 @@ def test_passes_average_to_one_picture_and_equal_seeds_repeat_it(monkeypatch):
     assert done == [2, 2, 1]
     assert image.shape == (12, 12, 3) and image.dtype == np.float32
     np.testing.assert_array_equal(image, render_passes(scene, 5, seed=3))
-    # No pass of seed 4 has the same random numbers as a pass of seed 3.
+    # No pass of a rendering with seed 4 has the same random numbers as a pass of a rendering with seed 3.
     other = render_passes(scene, 5, seed=4)
     assert (image != other).all(axis=2).mean() > 0.9
 

@@ -48,8 +48,8 @@ def tables():
 def test_bin_means_in_jax_equal_the_tables_of_the_evaluation(tables, law, kind):
     """Training in JAX and evaluation in Dr.Jit average the same target to the same means over bins.
 
-    Training and evaluation use different code and different points. A failure means that training fits other values
-    than the evaluation judges.
+    Training and evaluation use different code and different points. A failure means that training and evaluation
+    compute different values from the same target.
     """
     params, stretched = target.TARGETS[kind], kind == "stretched"
     across = BRASS.instances[0]._replace(anisotropic=-3.0 if stretched else 0.0)
@@ -82,7 +82,7 @@ def test_the_points_law_centre_evaluates_the_middle_of_the_bin(tables):
 
 
 def compound_poisson(rng, mean, quantum, shape):
-    """Draws random values of bins with few walks, whose expected value is `mean`.
+    """Draws random values of bins with few walks. The expected value of each bin is `mean`.
 
     The count of walks in a bin has a Poisson distribution, and each walk has a throughput from 0 to 1. `quantum` is the
     value of one walk of throughput 1.
@@ -96,10 +96,10 @@ def compound_poisson(rng, mean, quantum, shape):
 
 @pytest.mark.slow
 def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at_their_median():
-    """In bins with few walks, the log loss is least for a brightness at their median, which is darker than their mean.
+    """If bins have few walks, the log loss is minimal at their median brightness, which is below their mean brightness.
 
-    The bias of the Huber loss is less than 30 % of the bias of the log loss. The target is matte, and only its
-    brightness is fitted.
+    The bias of the Huber loss is less than 30 % of the bias of the log loss. In this test, the target is matte and only
+    its brightness is fitted.
     """
     rng, quantum = np.random.default_rng(6), 0.2
     base = replace(
@@ -151,7 +151,7 @@ def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at
 
 
 def exact_albedo(raw, mu):
-    """Returns the directional albedo (3,) of the blend with raw outputs `raw`, by quadrature in double precision."""
+    """Decodes `raw` to a blend and returns its directional albedo (3,), by quadrature in double precision."""
     cosines, weights = np.polynomial.legendre.leggauss(160)
     z, phi = 0.5 * (cosines + 1.0)[:, None], (np.arange(160) + 0.5)[None] * (math.pi / 160)
     r = np.sqrt(1.0 - z * z)
@@ -166,9 +166,9 @@ def exact_albedo(raw, mu):
 def test_albedos_and_their_derivatives_are_unbiased(tables):
     """Estimates of albedos and their derivatives have the means that quadrature gives (t-tests).
 
-    An estimate consists of two independent halves, and the mean of their product is the squared albedo. The false-alarm
-    rate is `FALSE_ALARM` over all comparisons. A failure means that training pulls albedos away from those of the
-    tables.
+    An estimate consists of two independent halves. The mean of the product of the halves is the squared albedo. The
+    false-alarm rate is `FALSE_ALARM` over all comparisons. A failure means that training makes albedos differ from the
+    albedos of the tables.
     """
     blocks, rows = 40, 32
     recipe = replace(TINY, encoding="direction", directional=False, rows=rows, albedo_samples=8)

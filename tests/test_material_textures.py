@@ -28,7 +28,7 @@ def test_colours_are_made_linear_and_numbers_are_not(material_file, tmp_path):
 
 
 def test_a_colour_may_be_given_in_hexadecimal_digits_of_srgb(material_file):
-    """The colour #3366ee is the sRGB triple 51, 102, 238 of 255, converted to linear light."""
+    """The colour #3366ee is (51, 102, 238) / 255 in sRGB, and is converted to linear light."""
     for digits in ("#3366ee", "#3366EE"):
         material = materials.load(material_file("albedo = 0.5", f"albedo = '{digits}'"))
         np.testing.assert_allclose(material.values["albedo"], [0.0331048, 0.1328683, 0.8549926], rtol=1e-5)
@@ -126,7 +126,10 @@ def test_an_image_without_colour_channels_is_refused_with_the_names_of_its_chann
 
 
 def test_images_repeat_as_often_as_the_file_says(material_file, tmp_path):
-    """The `uv_scale` of a material applies to all textures that have no `uv_scale` of their own, old or new."""
+    """The `uv_scale` of a material applies to all textures that have no `uv_scale` of their own.
+
+    The `uv_scale` also applies to textures that are added to a loaded material.
+    """
     write_image(tmp_path / "image.png", PACKED)
     both = "alpha_bottom = { texture = 'image.png', channel = 'g', uv_scale = 2.5 }\nalbedo = { texture = 'image.png' }"
     path = material_file("alpha_bottom = 0.2", both)

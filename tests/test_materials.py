@@ -79,7 +79,7 @@ def test_a_medium_through_which_walks_would_not_end_is_refused(material_file, gi
 
 
 def test_a_metal_whose_reflectance_overflows_is_refused(material_file):
-    """A conductor with an index of refraction of 1e4 is allowed and reflects all light.
+    """A conductor with an index of refraction of 1e4 is allowed and reflects over 99.9 % of the light.
 
     An index of 1e10 is refused, because the conductor would look black in single precision.
     """
@@ -159,7 +159,7 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_fault(material_file, old
     assert len(str(error.value)) < 1000 and "\n" not in str(error.value)
 
 
-# Values, keys and text fragments that make a material file faulty if they replace correct keys and values.
+# Texts that replace keys and values of a correct material file. Most of the replacements make the file faulty.
 NASTY = (
     "0.5",
     "1",
@@ -199,9 +199,9 @@ NASTY += ("[" * 3000, "1" * 400, "1" * 5000, "0x" + "f" * 9000, '"' + "a" * 5000
 
 
 def test_any_file_either_loads_or_is_refused_in_one_line(material_file):
-    """400 random faulty files either load or raise an error of one short line.
+    """Each of 400 randomly damaged files either loads or raises an error of one short line.
 
-    Each faulty file is a correct file with one or two keys or values replaced, and sometimes with a piece cut out.
+    Each damaged file is a correct file with one or two keys or values replaced, and sometimes with a piece cut out.
     """
     path, rng = material_file(), np.random.default_rng(0)
     good = [re.split("( = )", line) for line in path.read_text().strip().splitlines()]

@@ -39,7 +39,7 @@ def f_of(source, light, view):
 
 @pytest.fixture(scope="module")
 def planes():
-    """Planes of random entries, a tenth of which are not measured."""
+    """The three colour planes of a MERL file with random entries, a tenth of which are marked as not measured."""
     rng = np.random.default_rng(0)
     values = rng.random((3, *SHAPE)) + 0.1
     values[:, rng.random(SHAPE) < 0.1] = -1.0
@@ -95,7 +95,8 @@ def test_a_file_of_full_size_comes_back(planes, tmp_path):
 def test_the_layout_is_merls(planes, tmp_path):
     """A MERL file begins with the three dimensions of the grid, and all entries follow.
 
-    From one entry to the next, the index of phi_d varies fastest, then theta_d, then theta_h, and the channel last.
+    In the order of the entries, the index of phi_d varies fastest, followed by theta_d and theta_h. The channel varies
+    slowest.
     """
     path = tmp_path / "random.binary"
     Merl(planes).save(path)
@@ -109,7 +110,8 @@ def test_the_layout_is_merls(planes, tmp_path):
 def test_an_entry_is_the_value_in_the_middle_of_its_cell(planes):
     """In the middle of a cell, f is the cell's entry times the scale.
 
-    The database's own reader returns the same f, although it does not interpolate but rounds angles down to an entry.
+    The reader published with the MERL database returns the same f, although it rounds angles down to an entry instead
+    of interpolating.
     """
     h, d, p = inner_cells()
     expected = (planes[:, h, d, p] * SCALE[:, None]).T

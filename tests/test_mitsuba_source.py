@@ -71,7 +71,7 @@ def test_a_diffuse_bsdf_from_a_dictionary_a_file_and_a_fragment(tmp_path):
 
 @pytest.mark.parametrize("alphas", ((0.01, 0.01), (0.2, 0.2), (0.1, 0.4)))
 def test_a_rough_mirror_has_the_value_of_its_formula(alphas):
-    """The value of a rough mirror is that of Walter 2007, eq. 20, with a Fresnel term of 1."""
+    """The value of a rough mirror is given by eq. 20 of Walter 2007, with a Fresnel term of 1."""
     source = from_dict(MIRROR | {"alpha_u": alphas[0], "alpha_v": alphas[1]})
     wi, wo = pairs(2000, low=0.05)
     m = ops.normalize(wi + wo)
@@ -121,7 +121,7 @@ def test_textures_are_looked_up_where_asked():
 
 
 def test_lanes_keep_their_type():
-    """Values have the same array type as the directions: Dr.Jit's type, or Mitsuba's type with derivatives."""
+    """Values have the same array type as the directions: Dr.Jit's plain type, or Mitsuba's differentiable type."""
     wi, wo = pairs(10)
     source = from_dict(DIFFUSE)
     there = source.eval(Vec3(*map(mi.Float, wi)), Vec3(*map(mi.Float, wo)))
@@ -171,7 +171,7 @@ def test_variants_that_cannot_serve_are_refused():
 
 
 def nodes(fields, k=0):
-    """Returns (wi, wo, f cos(theta_o)) at the nodes of a material's grid, for the azimuth of incidence of index k.
+    """Returns (wi, wo, f cos(theta_o)) at the nodes of a material's grid, for the azimuth of incidence number k.
 
     The nodes are the points of the grid, warped by the distribution of visible normals. The value at a node is the
     grid's entry, times the distribution of normals, divided by the projected area (Dupuy and Jakob 2018, section 4).

@@ -13,7 +13,7 @@ from nma.sources import nbrdf, read
 from nma.sources.mitsuba_bsdf import measured
 from nma.sources.nbrdf import Nbrdf
 
-# The log loss of f cos(theta_o) between the network of a material and its measurement. The cosines of the pairs of
+# The log loss of f cos(theta_o) between the network and the measurement of each material. The cosines of the pairs of
 # directions are uniform in .05 .. 1.
 CLOSENESS = {
     "cc_ibiza_sunset": 0.0037,
@@ -34,13 +34,13 @@ def rgl_file(measurements):
 
 
 def rotation(axis, angle):
-    """The matrix that rotates vectors about y or z."""
+    """Returns the matrix that rotates vectors about y or z."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]] if axis == "y" else [[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def by_hand(weights, view, light):
-    """f of one pair of directions, in double precision, by the steps that the authors of the networks describe."""
+    """Returns f for a pair of directions in double precision, by the steps that the networks' authors describe."""
     half = (view + light) / np.linalg.norm(view + light)
     theta_h, phi_h = math.acos(half[2]), math.atan2(half[1], half[0])
     difference = rotation("y", -theta_h) @ rotation("z", -phi_h) @ light

@@ -18,7 +18,7 @@ from nma.target import PRINCIPLED_PARAMS
 def test_the_paper_s_network_has_7159_parameters():
     """The paper's network has 33 inputs, three hidden layers of 32 neurons, and 23 outputs.
 
-    The inputs are cos(theta_i) and the 32 numbers of an embedding, of which 100 are learnt.
+    The inputs are cos(theta_i) and an embedding of 32 numbers. The 7159 parameters include 100 such embeddings.
     """
     assert target.output_size(2) == 23
     layers = network.init(np.random.default_rng(0), [33, *network.hidden("3x32"), target.output_size(2)])
@@ -36,7 +36,7 @@ def test_networks_are_named_by_depth_and_width():
 def test_a_network_is_its_matrices(blocks, monkeypatch):
     """The outputs of a network equal matrix products with ReLU between the layers.
 
-    One layer has more neurons than the blocks of neurons in which the code for AVX-512 computes a layer.
+    The code for AVX-512 computes a layer in blocks of neurons, and one layer in this test is larger than a block.
     """
     monkeypatch.setattr(network, "_many_registers", lambda value: blocks)
     rng = np.random.default_rng(3)
@@ -61,7 +61,9 @@ def test_a_network_is_its_matrices(blocks, monkeypatch):
 
 
 def test_initial_layers_have_the_spread_of_their_law():
-    """Initial weights have the spread of He 2015, so that the outputs of a layer are about as large as its inputs.
+    """Initial weights have the standard deviation of He et al. 2015.
+
+    With this standard deviation, the outputs of a layer are about as large as its inputs.
 
     The last bias is the given array, and equal seeds give equal layers.
     """
@@ -146,7 +148,7 @@ def test_only_directional_adapters_depend_on_the_direction(form, name):
     varies = np.ptp(curves, axis=1).max() > 1e-3
     assert varies == adapter.directional
     if not adapter.directional:
-        # Only rounding may differ: a matrix product may sum the last rows in another order than the first.
+        # Only rounding may differ: a matrix product may add the terms of different rows in different orders.
         assert np.ptp(curves, axis=1).max() < 1e-6
     assert (np.ptp(curves, axis=0).max() > 1e-3) == (name != "direction")
 

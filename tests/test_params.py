@@ -71,7 +71,7 @@ def test_every_parameter_follows_its_law(population):
 def test_conductors_of_the_range_are_uniform(population):
     """In the population `range`, the values of eta and k of the conductors are uniform over their ranges.
 
-    In the population `mixed`, eta and k of all conductors that are no real metals are uniform too.
+    In the population `mixed`, eta and k of all conductors that are not real metals are uniform too.
     """
     vectors = draw(population)
     vectors = vectors[metal_of(vectors) < 0]

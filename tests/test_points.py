@@ -180,7 +180,10 @@ def test_figures_of_comparisons_equal_closed_forms():
 
 
 def test_a_coat_reflects_above_its_metal():
-    """The source `Coating` is reciprocal and darker with absorption. A coat of index 1 is invisible."""
+    """The source `Coating` is reciprocal, and absorption makes it darker.
+
+    A coat with a refractive index of 1 is invisible.
+    """
     rng = np.random.default_rng(2)
     mu, phi = rng.uniform(0.1, 1.0, (2, 500)), rng.uniform(0.0, 6.28, (2, 500))
     wi, wo = (direction(m, p) for m, p in zip(mu, phi, strict=True))

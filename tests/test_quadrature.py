@@ -144,7 +144,7 @@ def assert_in_bins(points, i, o, p, slack):
 
 
 def lobe(wi, wo, alpha):
-    """f cos(theta_o) of a white GGX mirror [1/sr]. Walter 2007, eq. 20."""
+    """Returns f cos(theta_o) of a white GGX mirror, in 1/sr (Walter 2007, eq. 20)."""
     m = ops.normalize(wi + wo)
     return ggx_d(m, alpha, alpha) * smith_g1(wi, alpha, alpha) * smith_g1(wo, alpha, alpha) / (4.0 * wi.z)
 

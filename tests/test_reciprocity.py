@@ -14,9 +14,10 @@ def test_adapters_with_constant_parameters_are_reciprocal():
 
 
 def test_both_orders_reflect_the_same_over_all_directions():
-    """The integral over both directions is symmetric, so that swapping wi and wo does not change it.
+    """Swapping wi and wo does not change the integral of f cos(theta_i) cos(theta_o) over all pairs of directions.
 
-    In each of the three channels, the means of both orders agree within four standard errors (false alarm 2e-4 in all).
+    In each of the three channels, the means with and without swapping agree within four standard errors. The
+    false-alarm rate is 2e-4 in all.
     """
     n, rng = 1 << 15, np.random.default_rng(1)
     both = reciprocity.pairs(random_adapter(), MATERIAL, np.sqrt(rng.random(n)), rng)

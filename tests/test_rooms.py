@@ -1,4 +1,4 @@
-"""The rooms of the package (its top-level modules) import only from rooms on lower floors.
+"""The rooms (top-level modules) of the package import only from rooms on lower floors of the architecture drawing.
 
 The committed drawing shows all rooms and imports.
 """
@@ -112,9 +112,10 @@ def test_the_page_names_registries_that_are_there():
 
 @pytest.fixture
 def ladder():
-    """Three floors of boxes, and the arrows between them. The arrow from "a" to "end" passes the second floor.
+    """Three floors of boxes, and the arrows between the boxes.
 
-    The order of the boxes on the second floor is wrong, because arrows would cross.
+    The arrow from "a" to "end" crosses the second floor. In the given order of the boxes on the second floor, some
+    arrows cross, so a layout must change this order.
     """
     floors = [["a", "b", "c"], ["z", "y", "x"], ["end"]]
     return floors, [("a", "x"), ("b", "y"), ("c", "z"), ("a", "end"), ("z", "end")]

@@ -119,7 +119,8 @@ def test_network_outputs_agree_on_every_instruction_set(name, compact):
             # The instruction set avx512_bf16 rounds activations to the 8 significant bits of bfloat16.
             assert np.sqrt((error**2).mean()) < 0.02
             continue
-        # A few inputs have larger errors, because the conductor's Fresnel term cancels digits.
+        # A few inputs have larger errors, because the formula of the conductor's Fresnel term loses digits by
+        # cancellation.
         assert np.quantile(error, 0.999) < 1e-5
         assert error.max() < 2e-4
         assert np.abs(outputs - found["portable"]).max() < 1e-4
@@ -179,7 +180,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
 def test_curves_have_the_values_of_the_network():
     """Values from curves agree with values from the network: the median error is below 5e-4 of a value.
 
-    nma/render/curves.py states a mean error of about 1e-4 for curves with the same count of nodes.
+    The docstring of nma/render/curves.py states a mean error of about 1e-4 for curves with the same count of nodes.
     """
     params, cosines = queries(8)
     wi = facing(cosines)

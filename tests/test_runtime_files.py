@@ -63,7 +63,10 @@ def ranged(group, number, **fields):
 
 
 def shifted(places, gap=b""):
-    """Returns a weights file with the bytes `gap` before its tensors, whose offsets are larger by `places` bytes."""
+    """Returns a weights file with the bytes `gap` before its tensors.
+
+    The header adds `places` bytes to the offset of every tensor.
+    """
     header, about, data = header_of("layered3-3x32")
     for entry in (entry for name, entry in header.items() if name != "__metadata__"):
         entry["data_offsets"] = [places + at for at in entry["data_offsets"]]
@@ -85,7 +88,7 @@ def with_more(tensor):
 
 
 def nested(depth):
-    """Returns a weights file whose training record makes its metadata nest `depth` deep."""
+    """Returns a weights file whose metadata is nested `depth` levels deep, by its training record."""
     _, about, _ = header_of("layered3-3x32")
     about["training"] = "HERE"
     text = json.dumps(about).replace('"HERE"', '{"a": ' * (depth - 1) + "1" + "}" * (depth - 1))

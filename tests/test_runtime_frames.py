@@ -1,4 +1,4 @@
-"""BRDFs in C++ include the frame of their view direction, in all three ways to prepare them.
+"""BRDFs in C++ include the frame of the plane of incidence, in all three ways to prepare a BRDF.
 
 BRDFs are prepared one by one, in a batch, or from curves.
 """

@@ -85,7 +85,7 @@ def random_materials(rng, n):
 def random_views(rng, n):
     """Returns random directions (n, 3).
 
-    In a quarter of the directions, the cosine is spread evenly over decades, down to 1e-4.
+    In a quarter of the directions, the cosine is log-uniform from 1e-4 to 1.
     """
     z = np.where(rng.random(n) < 0.25, 10.0 ** rng.uniform(-4, 0, n), rng.random(n))
     phi, r = 2.0 * np.pi * rng.random(n), np.sqrt(1.0 - z * z)
@@ -153,8 +153,8 @@ def scores(bridge, estimator, params, tables, per_row=1 << 18, seed=5):
     """Returns |z| of the difference between a table in C++ and a table of the package's walks.
 
     `estimator` says whether C++ fills its table from walks ("walk") or estimates ("estimate"). Estimates are compared
-    only in bins with a relative error below 3 %. In bins with larger errors, a few bright samples may dominate if the
-    coat is rough and the conductor smooth. If no bright sample is drawn, the stated error of the bin is too small.
+    only in bins with a relative error below 3 %. If the coat is rough and the conductor is smooth, a few bright samples
+    may dominate bins with larger errors. If no bright sample is drawn, the stated error of the bin is too small.
     """
     sums, squares = np.zeros((2, *GRID.shape))
     about = np.ascontiguousarray(params, np.float32)
@@ -246,7 +246,7 @@ def test_weights_of_samples_have_the_mean_of_walks(bridge, case):
 
 
 def test_albedos_have_no_noise_and_are_close_to_those_of_many_walks(bridge):
-    """An albedo is the mean of a fixed set of 256 walks, so that it has no noise between calls.
+    """An albedo is the mean of a fixed set of 256 walks, so that repeated calls return the same albedo.
 
     The albedo is within .1 of the mean of many walks, because the mean of 256 walks has a standard deviation of at most
     .5 / 16.

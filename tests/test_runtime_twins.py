@@ -1,6 +1,6 @@
-"""Twins are code that is written by hand in Python and again in C++. The tests compare the results of twins.
+"""Compares code that is written by hand in Python with its twin, the same code written by hand in C++.
 
-CONTRIBUTING.md lists all twins.
+CONTRIBUTING.md lists all such twins.
 """
 
 import ctypes
@@ -143,7 +143,8 @@ def test_networks_have_the_same_inputs(tmp_path, name, directional):
     for instruction_set in in_single_precision():
         found = Runtime(path, instruction_set).outputs(numbers, wi)
         error = np.abs(found[:, :inputs] - wanted)
-        # The conductor's Fresnel term cancels digits for a few metals, mostly at grazing angles.
+        # The formula of the conductor's Fresnel term loses digits by cancellation for a few metals, mostly at grazing
+        # angles.
         assert np.quantile(error, 0.999) < 2e-6
         assert error.max() < 2e-4
         assert not found[:, inputs:].any()

@@ -108,13 +108,14 @@ def mask(opacity, bsdf):
 def test_composites_are_linear_combinations_of_their_parts():
     """The picture of a composite is the weighted mean of the pictures of its parts, for a plate in front of the sky.
 
-    Z-tests of 24 means allow 5 standard errors, which are estimated from 32 renderings. A false alarm happens in about
-    one of two thousand runs. A failure means that a part inside a composite is evaluated or sampled wrongly.
+    The test compares 24 means and allows differences of 5 standard errors, which are estimated from 32 renderings. A
+    false alarm happens in about one of two thousand runs. A failure means that a part inside a composite is evaluated
+    or sampled wrongly.
     """
     layered, nma, diffuse = {"type": "layered", **MATERIAL}, {"type": "nma", **MATERIAL}, {"type": "diffuse"}
     flat = {"type": "normalmap", "normalmap": {"type": "srgb", "color": [0.5, 0.5, 1.0]}}
-    # Each composite has four weights. The picture of the composite is the weighted sum of four pictures: of layered, of
-    # nma, of diffuse, and of the sky.
+    # Each composite has four weights. The picture of the composite is the weighted sum of four pictures: of the BSDFs
+    # `layered`, `nma` and `diffuse`, and of the sky.
     composites = {
         "blend": (blend(0.3, layered, diffuse), (0.7, 0, 0.3, 0)),
         "mask": (mask(0.6, layered), (0.6, 0, 0, 0.4)),

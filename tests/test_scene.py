@@ -68,7 +68,7 @@ def test_shader_ball_file_is_written_once():
 def test_material_covers_forty_percent(name):
     """The material covers at least 40 % of the picture, at any resolution.
 
-    The measured shares of the picture are .446 in the view `hero`, .86 in `close` and .63 in `top`.
+    The material covers .446 of the picture in the view `hero`, .86 in `close` and .63 in `top`.
     """
     coverage = material_coverage((256, 256), name)
     assert coverage >= 0.40
@@ -234,7 +234,7 @@ def test_measure_wants_different_seeds(seeds):
 def test_ztest_false_alarms_are_as_stated():
     """At a false-alarm rate of 5 %, the Z-test rejects about 20 of 400 pairs of images with equal means.
 
-    With fresh seeds, 6 to 38 pairs are rejected in 99.98 % of all runs.
+    With random seeds, the number of rejected pairs would be between 6 and 38 in 99.98 % of all runs.
     """
     rng = np.random.default_rng(1)
     alarms = 0

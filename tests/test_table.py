@@ -37,7 +37,7 @@ ROUGH = {
 class Scatter:
     """A source whose walks end after one scattering event.
 
-    The method `draw` of a subclass returns wo and a factor of the throughput.
+    The method `draw` of a subclass returns wo and the factor by which the throughput is multiplied.
     """
 
     space = ParamSpace("scatter", (Param("rho", "rho", "uniform", 0.0, 1.0, 0.0, 1.0, "its colour", 3),))
@@ -99,7 +99,7 @@ def scatter_tables(source, grid, walks=1 << 21, rho=(0.8, 0.4, 0.0)):
 
 
 def test_bins_of_a_lambertian_surface_are_normalised():
-    """Every bin has the mean of rho / pi cos(theta_o) over the bin (paper eq. 9)."""
+    """The value of every bin is the mean of rho / pi cos(theta_o) over the bin (eq. 9 of the paper)."""
     tables = scatter_tables(Lambert(), SMALL)
     expected = np.broadcast_to((0.8 / math.pi * middles(5))[:, None], (1, 4, 5, 6))
     assert_table(tables, expected)
@@ -160,7 +160,7 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
     """The full table, with the azimuths of wi and wo, agrees with the folded table of their difference.
 
     For a pair of azimuth bins of the full table, the density of azimuth differences is triangular. So the mean of the
-    folded table, weighted with a triangle, must equal the value of the full table.
+    folded table with triangular weights must equal the value of the full table.
     """
     steps, fine = 8, 8
     params, source = LAYERED3.vector(ROUGH)[None], sources.get("layered3")
@@ -176,7 +176,7 @@ def test_the_folded_table_equals_the_folded_anisotropic_one():
         / steps**2
     )
 
-    # Unfold the folded table to the whole circle. Then average the circle with a triangle of weights around each
+    # Unfold the folded table to the whole circle. Then average the unfolded table with triangular weights around each
     # difference d.
     circle = np.concatenate([folded.values[0, ..., 0], folded.values[0, ..., ::-1, 0]], axis=2)
     noise = np.concatenate([folded.error[0, ..., 0], folded.error[0, ..., ::-1, 0]], axis=2)

@@ -24,7 +24,7 @@ SINGLE_EPS = 2.0**-24
 def to_single(tree):
     """Rounds to single precision and converts back to double precision.
 
-    So computations in single and in double precision get exactly the same inputs.
+    After this rounding, computations in single and in double precision get exactly the same inputs.
     """
     return mapped(tree, lambda x: x.astype(np.float32).astype(np.float64))
 
@@ -85,8 +85,8 @@ def test_eval_equals_mitsuba_principled():
     computes in single precision, so that the test allows larger differences in two cases:
     - The clearcoat is divided by the sum 1 + (alpha^2 - 1) cos^2(theta_h), so that the relative error of the clearcoat
       may be a few rounding errors divided by this sum.
-    - If both directions are grazing, and opposite within a hundredth, the cosine between direction and half vector
-      loses digits, so that a relative difference of 2e-3 is allowed.
+    - If both directions are grazing and almost opposite (cos(theta_d) < .005), the cosine between direction and half
+      vector loses digits, so that a relative difference of 2e-3 is allowed.
 
     Directions whose cosine is below .001 are not compared. Near the horizon, Mitsuba's cosine between direction and
     half vector may become negative by rounding, and Mitsuba returns zero.

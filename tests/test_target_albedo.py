@@ -52,7 +52,7 @@ def estimate(blend, mu):
 def random_blends(params, instances, seed, scale):
     """Returns CASES random blends and cosines.
 
-    The parameters span their ranges and are often at an end. Many of the cosines are near 0.
+    The parameters span their ranges, and many of them are at an end of their range. Many of the cosines are near 0.
     """
     rng = np.random.default_rng(seed)
     mu = np.maximum(rng.random(CASES) ** rng.choice([1.0, 3.0], CASES), 1e-3)

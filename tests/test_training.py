@@ -164,7 +164,7 @@ def test_the_paper_s_preset_runs(tables):
     ("instances", "directional"), [(1, False), (2, False), (1, True), (2, True), (5, True)], ids=str
 )
 def test_every_variant_starts_at_a_plausible_blend(tables, instances, directional):
-    """The values of an untrained network are finite and at least 0, in every variant."""
+    """The target of an untrained network has finite values of at least 0, for every count of instances."""
     recipe = replace(TINY, instances=instances, directional=directional)
     layers = training.initial_layers(recipe, LAYERED3)
     assert layers[-1][1].shape == (target.output_size(instances),)

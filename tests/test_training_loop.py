@@ -20,7 +20,10 @@ START = {"moved": np.array([3.0, -2.0]), "held": (np.array(5.0),)}
 
 
 def distance(weights, batch, recipe):
-    """Returns a loss and a log loss, which are least if `moved` is 1. `held` adds to the loss but has no gradient."""
+    """Returns a loss and a log loss, which are minimal if `moved` is 1.
+
+    `held` adds a term without gradient to the loss.
+    """
     total = ((weights["moved"] - 1.0) ** 2).sum() + jax.lax.stop_gradient(weights["held"][0]) ** 2
     return total, total - 25.0
 

@@ -1,7 +1,8 @@
 """The random walk of the layered source, compared with results that are known without random walks.
 
 Statistical tests compare the mean of walks with the known value by a Z-test. A test has the false-alarm rate
-`FALSE_ALARM`, divided among its comparisons by Sidak's correction. Seeds are fixed, so a passing test keeps passing.
+`FALSE_ALARM`, divided among its comparisons by Sidak's correction. Seeds are fixed, so that a test that passes once
+always passes.
 """
 
 import numpy as np
@@ -19,8 +20,8 @@ Float, PCG32 = dr.auto.Float, dr.auto.PCG32
 FALSE_ALARM = 1e-3
 WALKS = 1 << 18
 
-# The parameters of a conductor that reflects all light, of a coat without effect, and of a conductor that reflects no
-# light.
+# WHITE is a conductor that reflects all light, NO_COAT is a coat without effect, and BLACK is a conductor that reflects
+# no light.
 WHITE = {"eta_conductor": 0.0, "k_conductor": 1.0}
 NO_COAT = {"eta_top": 1.0, "alpha_top": 1e-4}
 BLACK = {"eta_conductor": 1.0, "k_conductor": 0.0, "alpha_bottom": 1e-4}
@@ -157,9 +158,10 @@ def test_isotropic_slab_over_black():
 
 
 def test_rough_coat_over_white_conductor():
-    """The albedo of a rough coat over a white conductor is .556, to three digits.
+    """The albedo of a rough coat over a white conductor at cos(theta_i) = .9 is .556, to three digits.
 
-    In two public programs, evaluation and random walks give different albedos for this rough coat over a conductor.
+    This rough coat over a conductor is a hard case: in two public programs, evaluation and random walks disagree about
+    its albedo.
     """
     found, error = albedo(0.9, 1 << 20, eta_top=1.5, alpha_top=0.2, alpha_bottom=0.4, **WHITE)
     assert_equal_means(found, error + 0.5e-3 / 3.3, 0.556)
