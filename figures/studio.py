@@ -29,7 +29,8 @@ def describe(material: Material) -> str:
 
 
 def worst_to_median(errors: ArrayLike, count: int) -> NDArray[np.intp]:
-    """Returns `count` indices (or fewer if there are few errors) at even steps from the largest error to the median."""
+    """Returns indices of `count` errors (or of fewer, if there are few), at even steps from the largest to the
+    median."""
     worst_first = np.argsort(errors)[::-1]
     return worst_first[np.unique(np.linspace(0, len(worst_first) // 2, count).astype(int))]
 
@@ -44,7 +45,7 @@ def render(
 def scene(bsdf: dict[str, Any], size: int, sampler: str = "independent") -> dict[str, Any]:
     """Returns the preview scene with a sky but no sun, a soft box in place of the lamp, and one bounce of light.
 
-    Small lights and caustics would cause noise, which would hide the differences between adapters.
+    Small lights and caustics are avoided, because they would cause noise that hides the differences between adapters.
     """
     made = nma.preview_scene(bsdf, size=(size, size), lighting="outdoors", hide_sun=True, max_depth=3)
     made["sensor"]["sampler"]["type"] = sampler

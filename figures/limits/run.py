@@ -1,11 +1,11 @@
-"""What limits the accuracy of class adapters: comparison with fits to single materials, with several targets.
+"""Finds what limits the accuracy of class adapters, by comparison with fits to single materials with several targets.
 
     python -m figures.limits.run [--quick] [--materials N]
 
-A fit is trained on the material that it is evaluated on, so its remaining error comes from the target. A class adapter
-with the same target has a larger error; the difference comes from the network, the data and the optimiser. The
-materials are the first of the set "range", which is in random order; --materials is their number. Each material is
-fitted to its reference and evaluated on the same reference. The metrics of finished materials are kept in
+A fit is trained on the table that it is evaluated on, so its remaining error comes from the target. A class adapter
+with the same target has a larger error, and the additional error comes from the network, the data and the optimiser.
+The materials are the first --materials of the set "range", which is in random order. Each fit is trained on the
+material's reference table and evaluated on the same table. The metrics of finished materials are kept in
 out/figures/limits.
 
 Writes limits.json and limits.png beside this file. With --quick, makes short fits to two materials and writes to
@@ -29,7 +29,7 @@ from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
 SET = "range"
-# The targets of the fits. The first target is also the target of the class adapters.
+# The targets of the fits. The first target is the same as that of the shipped class adapters.
 TARGETS: dict[str, dict[str, Any]] = {
     "fit, two instances": {"target": "principled"},
     "fit, two stretched": {"target": "stretched"},
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def contenders(reference: nma.Tables, number: int, arguments: Namespace) -> dict:
-    """Returns the metrics of adapters, fits and noise for one material, from a file if the file exists."""
+    """Returns the metrics of adapters, fits and noise for one material, and stores these metrics in a file."""
     stored = common.ROOT / "out/figures/limits" / f"{number}-{len(reference.params)}-{arguments.steps}.json"
     table = reference[number : number + 1]
     return common.kept(stored, partial(compete, number, table, arguments), arguments.quick)

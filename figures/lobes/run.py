@@ -34,13 +34,13 @@ VARIANTS = {
     "single": {"instances": 1, "directional": False, "target": "principled"},
     "blended + ωi": {"instances": 2, "directional": True, "target": "principled"},
 }
-# Values above CUT times the value of the PEAK_BINS-th brightest bin are cut off in the plot.
+# The plot cuts off values that exceed CUT times the value of the PEAK_BINS-th brightest bin.
 CUT, PEAK_BINS = 4.0, 6
 COLOURS = ("#d62728", "#2ca02c", "#1f5fd0")
 
 
 class Fit(NamedTuple):
-    """A material's reference table (40, 40, 40, 3), and the table (40, 40, 40, 3) and metrics of each variant."""
+    """A material's reference table (40, 40, 40, 3), and for each variant its table (40, 40, 40, 3) and metrics."""
 
     reference: NDArray
     tables: dict[str, NDArray]
@@ -82,7 +82,7 @@ def fit(name: str, quick: bool) -> Fit:
 
 
 def in_plane(table: NDArray, angle: float) -> tuple[NDArray, NDArray]:
-    """Slices a table (theta_i, theta_o, phi, 3) in the plane of incidence, for an angle of incidence in degrees.
+    """Cuts a table (theta_i, theta_o, phi, 3) along the plane of incidence, for an angle of incidence in degrees.
 
     Returns the angles theta_o [radians], positive on the side of the mirror direction, and the values (angles, 3).
     """
@@ -101,7 +101,7 @@ def plane_errors(table: NDArray, reference: NDArray) -> dict[str, float]:
 
 
 def plot(fits: dict[str, Fit], path: Path) -> None:
-    """Draws the lobes, with a row for each material and variant and a column for each angle."""
+    """Draws the lobes, with a row for each pair of material and variant, and a column for each angle of incidence."""
     rows = [(name, label) for name in fits for label in VARIANTS]
     figure = Figure(figsize=(11, 1.7 * len(rows) + 0.7), layout="constrained")
     axes = figure.subplots(len(rows), len(ANGLES), squeeze=False)

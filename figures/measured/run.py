@@ -48,8 +48,8 @@ from nma.train.principled import CONSTANT, fit_constant
 
 DATA = common.DATA
 RGL = ("cc_ibiza_sunset", "cg_sunflower", "colodur_napoli_4f", "paper_white")
-# Ranges of cos(theta_i) and cos(theta_o). The keys are endings of the metrics' names. The NBRDF networks reach
-# their published errors for cosines above .05, because grazing measurements are the hardest to fit.
+# Ranges of cos(theta_i) and cos(theta_o). The keys are appended to the names of the metrics. The NBRDF networks reach
+# their published errors only for cosines above .05, because grazing directions are the hardest to fit.
 RANGES = {"": (0.02, 1.0), " from .05": (0.05, 1.0)}
 TIMED_PAIRS = 1 << 18
 SAMPLER = "multijitter"
@@ -68,7 +68,7 @@ BRUSHED = {
 
 
 class Material(NamedTuple):
-    """A material's source, the BSDF that renders the source without an adapter, and the NBRDF network (or None)."""
+    """A material's source, the BSDF that renders this source without an adapter, and the NBRDF network (or None)."""
 
     name: str
     source: Values
@@ -164,7 +164,7 @@ def alternatives(
     if material.source.isotropic:
         path = kept / f"{slug(material)}_constant_{constant_steps}.safetensors"
         if not path.exists():
-            # The albedo term is off because the results in this folder were fitted without this term.
+            # The loss has no albedo term, because the committed results were fitted without this term.
             recipe = replace(CONSTANT, steps=constant_steps, albedo=0.0)
             fit_constant(tabulate_values(material.source), recipe).adapter.save(path)
         constant = Adapter.load(path)
@@ -173,8 +173,7 @@ def alternatives(
 
 
 def judged(material: Material, models: dict[str, tuple[Values, int]]) -> list[dict[str, Any]]:
-    """Returns a row for each model: number of parameters, time per pair of directions, and metrics in each range of
-    cosines."""
+    """Returns a row for each model: number of parameters, time per pair of directions, metrics by range of cosines."""
     times = nanoseconds([model for model, _ in models.values()])
     rows = []
     for (name, (model, parameters)), ns in zip(models.items(), times, strict=True):
@@ -191,9 +190,9 @@ def slug(material: Material) -> str:
 
 
 def nanoseconds(models: list[Values], repetitions: int = 7) -> list[float]:
-    """Returns the nanoseconds of each model per pair of directions, without compilation.
+    """Returns each model's shortest time in nanoseconds per pair of directions, without compilation.
 
-    A repetition evaluates TIMED_PAIRS pairs with every model on all cores. The shortest time of each model counts.
+    Each repetition evaluates TIMED_PAIRS pairs with every model on all cores.
     """
     rng = np.random.default_rng(0)
     lanes = [dr.auto.Float(rng.random(TIMED_PAIRS).astype(np.float32)) for _ in range(4)]
@@ -243,7 +242,7 @@ def rendered(
 
 
 def flip_picture(errors: np.ndarray) -> np.ndarray:
-    """Returns a FLIP map (height, width), 0 .. 1, as a picture of bytes, in the colour map of FLIP's authors."""
+    """Returns a FLIP map (height, width), 0 .. 1, as a picture of bytes, in the colours that FLIP's authors use."""
     return (colormaps["magma"](np.clip(errors, 0.0, 1.0))[..., :3] * 255.0).astype(np.uint8)
 
 

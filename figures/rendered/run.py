@@ -1,4 +1,4 @@
-"""Rendered error of the shipped adapters and of the variant "single" by samples per pixel (paper Table 2, FLIP).
+"""Errors of pictures rendered with the shipped adapters and the variant "single", by samples per pixel (paper Table 2).
 
     python -m figures.rendered.run [--quick] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
         [--single WEIGHTS] [--only SUBJECT ...]
@@ -45,7 +45,7 @@ SINGLE_WEIGHTS = common.ROOT / "out/figures/variants/single_8000_6000-steps_seed
 # adapters' variance to a sixth of the variance with independent samples, and the simulation's variance to two thirds.
 SAMPLER = "multijitter"
 FIRST_LEVEL = 64
-# The second simulation has at most this many samples per pixel, enough to see how its noise falls.
+# The second simulation has at most AGAIN_SPP samples per pixel, which is enough to see how its noise falls.
 AGAIN_SPP = 256
 ROWS = 4
 
@@ -65,8 +65,8 @@ class Subject(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The prefix of the pictures' file names, with a hash of the weights, so that pictures are rendered again for
-        new weights."""
+        """The prefix of the pictures' file names. The prefix contains a hash of the weights, so that pictures are
+        rendered again after the weights have changed."""
         if self.weights is None:
             return f"layered_seed-{self.seed}"
         layers = nma.Adapter.load(self.weights).layers
@@ -123,7 +123,7 @@ def subjects(arguments: argparse.Namespace) -> list[Subject]:
 
 
 def levels(spp: int) -> list[int]:
-    """Returns the numbers of samples per pixel at which pictures are kept: FIRST_LEVEL, and its doubles up to `spp`."""
+    """Returns the samples per pixel of the stored pictures: FIRST_LEVEL, doubled repeatedly up to `spp`."""
     found = [min(FIRST_LEVEL, spp)]
     while found[-1] < spp:
         found.append(min(2 * found[-1], spp))
@@ -133,7 +133,7 @@ def levels(spp: int) -> list[int]:
 def gallery(
     subject: Subject, materials: list[nma.materials.Material], size: int, kept: Path
 ) -> list[NDArray[np.float32]]:
-    """Returns the pictures (levels, size, size, 3) of each material, and renders those whose file does not exist."""
+    """Returns each material's pictures (levels, size, size, 3), and renders the pictures whose file is missing."""
     found, bar = [], progress("materials/min")
     with bar:
         task = bar.add_task(subject.name, total=len(materials), rate="", note=f"{subject.spp} spp")
@@ -150,7 +150,7 @@ def gallery(
 
 
 def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
-    """Returns the pictures of lower levels, if an earlier run with fewer samples per pixel has rendered them."""
+    """Returns the pictures that an earlier run with fewer samples per pixel has rendered, or an empty list."""
     for spp in reversed(levels(subject.spp)[:-1]):
         shorter = path.with_name(path.name.replace(f"_{subject.spp}-spp_", f"_{spp}-spp_"))
         if shorter.exists():
@@ -161,10 +161,10 @@ def earlier(path: Path, subject: Subject) -> list[NDArray[np.float32]]:
 def converge(
     subject: Subject, bsdf: dict[str, Any], size: int, found: list[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """Renders pictures (levels, size, size, 3). Each level adds samples to the picture of the level before.
+    """Renders pictures (levels, size, size, 3), where each level adds samples to the picture of the previous level.
 
     Args:
-        found: the pictures of the first levels, if an earlier run has rendered them.
+        found: the pictures of the lowest levels that an earlier run has rendered; may be empty.
     """
     steps = levels(subject.spp)
     before = steps[len(found) - 1] if found else 0
@@ -224,7 +224,7 @@ def mean(rows: list[dict[str, float]], metric: str) -> float:
 
 
 def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.Namespace) -> str:
-    """Returns tables in Markdown: all metrics at the most samples per pixel, then FLIP by samples per pixel."""
+    """Returns tables in Markdown: all metrics at the largest number of samples, then FLIP by samples per pixel."""
     most = arguments.spp
     lines = [
         f"{arguments.materials} materials, {arguments.resolution} x {arguments.resolution} pixels; reference:"
@@ -274,7 +274,7 @@ def sheet(
     materials: list[nma.materials.Material],
     path: Path,
 ) -> None:
-    """Writes a sheet with pictures of ROWS materials: from the largest to the median HDR-FLIP of the best adapter."""
+    """Writes a sheet with pictures of ROWS materials, from the largest to the median HDR-FLIP of the best adapter."""
     shown = [name for name in flips if name != AGAIN]
     best = nma.shipped()[-1]
     chosen = studio.worst_to_median(flips[best]["flip_hdr"], ROWS)

@@ -1,4 +1,4 @@
-"""Writes the model cards of the shipped adapters, with training, accuracy, worst materials and known limits."""
+"""Writes the model cards of the shipped adapters. A card lists training, accuracy, worst materials and known limits."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ LIMITS = """\
 - The target's parameters depend on the view direction, so the BRDF is not reciprocal. Light tracing and bidirectional
   methods converge to a picture that differs from path tracing, unless they
   [prepare the blend for the camera's side](../../docs/mitsuba.md#reciprocity).
-- The reflection is isotropic, and its lobes have the shapes of the Principled BRDF. Where a material's lobes have other
-  shapes, the adapter has errors, which the worst materials above show.
+- The reflection is isotropic, and its lobes have the shapes of the Principled BRDF. The adapter has errors where a
+  material's lobes have other shapes, as in the worst materials above.
 """
 
 
@@ -60,7 +60,7 @@ adapter's network has the size {recipe["network"]}, {count:,} parameters, and th
 ## Training
 The dataset has {data["materials"]:,} materials of the population `{data["population"]}` (seed {data["seed"]}), with
 {data["walks"]:,} walks per material. Training took {record["steps"]:,} steps with {record["bins_seen"]:,} bins in all,
-and {record["seconds"] / 60:.0f} minutes on {record["device"]} ({record["date"]}).
+and {record["seconds"] / 60:.0f} minutes on the device `{record["device"]}` ({record["date"]}).
 [docs/training.md](../../docs/training.md) has the commands, and `nma info {name}` prints every setting.
 
 ## Metrics on unseen materials

@@ -1,10 +1,10 @@
-"""Accuracy of the shipped adapters on unseen materials: 89 from Table 1's ranges, and 60 with real metals.
+"""Accuracy of the shipped adapters on unseen materials: 89 from the ranges of the paper's Table 1, 60 with real metals.
 
     python -m figures.shipped.run [--quick] [--adapter FILE ...]
 
 Every third of the 60 materials has a metal that was held out of training. The references have 64 M walks per material.
-They are simulated with fixed seeds, only once, and stored in out/references. The simulation takes about 15 minutes on 2
-cores; a killed simulation can be resumed.
+The references are simulated once, with fixed seeds, and stored in out/references. The simulation takes about 15 minutes
+on 2 cores, and a killed simulation can be resumed.
 
 Writes shipped.json, shipped.png and a model card for each adapter beside this file. With --quick, takes few materials
 and walks, and writes to out/figures/shipped.

@@ -1,10 +1,10 @@
-"""BRDF slices of six unseen materials, simulated and by the adapter, at two angles of incidence (paper Fig. 10).
+"""BRDF slices of six unseen materials, from the simulation and the adapter, at two angles of incidence (paper Fig. 10).
 
     python -m figures.slices.run [--quick] [--adapter FILE]
 
-A slice shows f cos(theta_o) for all directions wo, at 70 degrees or at normal incidence. The materials are taken from
-the set "range" (figures/common.py): the set is sorted by the roughness of the coat, and materials at even
-intervals in this order are chosen.
+A slice shows f cos(theta_o) for all directions wo, at an angle of incidence of 70 or 0 degrees. The materials of the
+set "range" (figures/common.py) are sorted by the roughness of the coat, and materials at even intervals in this order
+are shown.
 
 Writes slices.json and slices.png beside this file. With --quick, takes four materials with few walks, and writes to
 out/figures/slices.
@@ -53,7 +53,7 @@ def chosen(tables: nma.Tables) -> nma.Tables:
 
 
 def summary(tables: nma.Tables, adapter: NDArray, label: str) -> dict:
-    """Returns for each slice [1/sr]: mean absolute error, mean value, and the error that noise alone gives."""
+    """Returns mean absolute error, mean value and error of noise alone for each slice, in 1/sr."""
     slices = []
     for m, params in enumerate(tables.params):
         entry: dict = {"params": [round(float(x), 5) for x in params]}

@@ -2,10 +2,11 @@
 
     python -m figures.supervision.run [--quick]
 
-Training compares the bin's value in a table with the mean of the target over one or more points in the bin. Here a 3x32
-network, whose only input is the view direction, is fitted to a smooth conductor and to a layered material. All fits use
-the paper's loss and target and the same table, steps and learning rate; only the points differ. The fit in the last
-column uses all settings of `nma fit`. Every fit is compared with an independent table and rendered.
+Training compares the bin's value in a table with the mean of the target over one or more points in the bin. The
+experiment fits a 3x32 network, whose only input is the view direction, to a smooth conductor and to a layered material.
+All fits to one material use the same table, steps and learning rate. The fits use the paper's loss and target, and
+differ only in the points; but the fit in the last column uses all settings of `nma fit`. Every fit is compared with an
+independent table and rendered.
 
 Writes supervision.json and supervision.png beside this file. With --quick, makes three short fits and writes to
 out/figures/supervision.
@@ -31,7 +32,7 @@ from nma.table import stream_keys
 from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
-# The paper's conductor has no coat. Materials of our class always have a coat, so ours is given a smooth coat whose
+# The paper's conductor has no coat. Materials of our class always have a coat, so our conductor has a smooth coat whose
 # index of refraction is close to 1.
 BARE = {"alpha_top": 0.001, "alpha_bottom": 0.01, "eta_top": 1.05, "albedo": 1.0, "sigma_t": 0.0}
 LAYERED = "gold-red-lacquer"
@@ -132,7 +133,7 @@ def caption(figures: dict[str, float]) -> str:
 
 
 def note(effort: Effort) -> str:
-    """Returns the note below the pictures, which says how the pictures were made."""
+    """Returns the note below the pictures, which says how the fits and the pictures were made."""
     return (
         f"Every fit: {effort.steps} steps on one table of {effort.walks / 1e6:.0f} M walks. Log loss and albedo error "
         f"against another table of {effort.reference_walks / 1e6:.0f} M walks.\n"

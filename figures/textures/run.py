@@ -2,9 +2,10 @@
 
     python -m figures.textures.run [--quick] [--adapter FILE]
 
-The preview scene with one material is rendered by simulation and with the adapter: (a) without textures, (b) with a
-texture for the metal's roughness, (c) with a second texture for the extinction, (d) with a third texture for the albedo
-of the medium. A second simulation has as many samples per pixel as the adapter; the error of its picture is only noise.
+The preview scene with one material is rendered by simulation and with the adapter, in four steps: (a) without textures,
+(b) with a texture for the metal's roughness, (c) with a second texture for the extinction, (d) with a third texture for
+the albedo of the medium. A second simulation has as many samples per pixel as the adapter; the error of its picture is
+only noise.
 
 Writes textures.json and textures.png beside this file. With --quick, renders only (a) and (d) in small pictures with
 few samples, and writes to out/figures/textures.
@@ -41,7 +42,8 @@ TABLED = ("flip_hdr", "flip_ldr", "smape", "ssim")
 
 
 class Size(NamedTuple):
-    """Size of the pictures in pixels, and samples per pixel of the reference and of the other two pictures."""
+    """Size of the pictures in pixels, samples per pixel of the reference, and samples per pixel of the other
+    pictures."""
 
     pixels: int
     reference_spp: int
@@ -49,7 +51,7 @@ class Size(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Pictures of the reference and the adapter, the adapter's metrics, and the metrics of the second simulation."""
+    """One step: pictures of the reference and the adapter, and metrics of the adapter and of the second simulation."""
 
     reference: np.ndarray
     adapter: np.ndarray
@@ -115,7 +117,7 @@ def summary(steps: dict[str, Step], adapter: str, size: Size) -> dict:
 
 
 def plot(steps: dict[str, Step], adapter: str, size: Size, path: Path) -> None:
-    """Draws a column for each step (reference, adapter, and the FLIP between them), with a table of metrics below."""
+    """Draws a column for each step: reference, adapter, and the FLIP between them. A table of metrics is below."""
     made = list(steps.values())
     differences = [difference_image(s.adapter, s.reference, kind="flip", scale=FLIP_SCALE) for s in made]
     rows = [

@@ -18,12 +18,12 @@ from nma.materials import Material
 from nma.render.load import material_bsdf
 
 Images = NDArray[np.float32]
-# Seeds of the reference, of a second simulation (for the metrics of noise alone), and of the adapters.
+# Seeds for the pictures of the reference, of a second simulation (whose error is noise alone), and of the adapters.
 REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
 
 
 class View(NamedTuple):
-    """How the first `materials` materials of the validation set are rendered.
+    """Settings of the pictures of the first `materials` materials of the validation set.
 
     Pictures have `size` x `size` pixels, with `spp` samples per pixel for adapters and `reference_spp` for the
     simulation.
@@ -60,7 +60,7 @@ class Gallery:
         )
 
     def pictures(self, job: Job, adapter: nma.Adapter) -> Images:
-        """Returns the adapter's pictures, which are rendered again if the weights are newer than the pictures."""
+        """Returns the adapter's pictures. Stored pictures that are older than the weights are rendered again."""
         weights = self._store.weights(job)
 
         def bsdf(material: Material) -> dict[str, Any]:
@@ -104,7 +104,8 @@ def compare(pictures: Images, references: Images) -> dict[str, float]:
 
 
 def sheet(gallery: Gallery, pictures: dict[str, Images], path: Path, rows: int = 4) -> None:
-    """Writes a sheet like the paper's Fig. 6: materials from the largest to the median error of the first variant."""
+    """Writes a sheet like the paper's Fig. 6, with materials from the largest to the median error of the first
+    variant."""
     flips = {
         name: [nma.compare_images(a, b)["flip_ldr"] for a, b in zip(images, gallery.reference, strict=True)]
         for name, images in pictures.items()

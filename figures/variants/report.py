@@ -1,4 +1,4 @@
-"""Report of all trainings: means and deviations over seeds, ordering of the variants, tables, and plot of Fig. 3."""
+"""Report of the trainings: means and standard deviations, ordering of the variants, tables, and plot of Fig. 3."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nma.images.metrics import METRICS
 
 Results = dict[Job, dict[str, Any]]
 WORST, BEST = "single", "blended + omega_i"
-# The names of the rows of Table 3, by variant.
+# The names of the rows of the paper's Table 3, by variant.
 ROWS_3 = {"omega_i": "1 instance", BEST: "2 instances"} | {name: name for name in INSTANCES}
 
 
@@ -47,7 +47,7 @@ def summary(results: Results, sizes: list[int]) -> dict[str, Any]:
 def orderings(results: Results, sizes: list[int]) -> dict[str, dict[str, list[bool]]]:
     """Returns whether `single` is worst and `blended + omega_i` is best, by metric and dataset size.
 
-    The results are lists of truth values, with one value for each seed with which all variants were trained.
+    Each result is a list of truth values, one for each seed with which all variants were trained.
     """
     found: dict[str, dict[str, list[bool]]] = {}
     for size in sizes:
@@ -73,7 +73,7 @@ def _errors(runs: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
     found = {"log loss": {name: run["tables"]["log_loss"] for name, run in runs.items()}}
     if all("images" in run for run in runs.values()):
         for metric in METRICS:
-            # A higher SSIM is better, so its sign is changed: then all values are errors.
+            # A higher SSIM is better, while the other metrics are errors, so the sign of the SSIM is changed.
             sign = -1.0 if metric == "ssim" else 1.0
             found[metric] = {name: sign * run["images"][metric] for name, run in runs.items()}
     return found
@@ -81,7 +81,11 @@ def _errors(runs: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 def markdown(found: dict[str, Any], noise: dict[str, float], floor: float) -> str:
     """Returns all tables with headings, in Markdown."""
-    parts = ["## Log loss (Fig. 3)", loss_table(found["log_loss"]), f"Noise of the references: {floor:.5f}."]
+    parts = [
+        "## Log loss (Fig. 3)",
+        loss_table(found["log_loss"]),
+        f"The noise of the references alone gives a log loss of {floor:.5f}.",
+    ]
     parts += ["## Ordering", ordering_lines(found["ordering"])]
     for title, names, paper in (
         ("## Images (Table 2)", {name: name for name in (*VARIANTS, *nma.shipped())}, TABLE_2),

@@ -3,8 +3,8 @@
     python -m figures.variants.run [--quick] [--data FOLDER.zarr] [--sizes N ...] [--seeds N] [--steps N]
         [--only VARIANT ...] [--materials N] [--resolution N] [--spp N] [--reference-spp N]
 
-Trains every variant on the first materials of a dataset (`nma dataset`, see docs/training.md), for several numbers of
-materials. Also trains every variant on the validation set, which gives a lower bound of the validation error. All
+Trains every variant on the first N materials of a dataset (`nma dataset`, see docs/training.md), for several N
+(--sizes). Also trains every variant on the validation set, which gives a lower bound of the validation error. All
 trainings together take hours. The adapters, their metrics and their pictures are kept in out/figures/variants, so a
 killed run continues where it stopped, and nothing is computed twice. With --only, only the named variants are trained;
 the report still contains all adapters that exist.
@@ -45,7 +45,7 @@ def main() -> None:
     data = quick_dataset(kept / "data.zarr") if quick else arguments.data
     validation = common.reference(SET, quick)
     if quick:
-        # With so few steps, optimised compilation would take longer than the training.
+        # With so few steps, compilation with optimisations would take longer than the training.
         jax.config.update("jax_disable_most_optimizations", True)
         validation = validation[:QUICK_VALIDATION]
     name = f"{SET}-{len(validation.params)}x{int(validation.walks[0])}"
@@ -109,7 +109,7 @@ def write(
     arguments: argparse.Namespace,
     done: dict[Job, nma.Adapter],
 ) -> None:
-    """Prints the tables, and writes tables, metrics, plot and pictures."""
+    """Prints the tables, and writes files with tables, metrics, plot and pictures."""
     floor = next(iter(results.values()))["tables"]["noise_floor"]
     noise = gallery.noise()
     found = report.summary(results, arguments.sizes)

@@ -48,7 +48,7 @@ class Job:
     @property
     def recipe(self) -> Recipe:
         instances, directional = ALL[self.variant]
-        # A stretched target depends on wi, so variants that do not depend on wi have the target "principled".
+        # The target "stretched" depends on wi, so variants that do not depend on wi have the target "principled".
         target = None if directional else "principled"
         settings = {"instances": instances, "directional": directional, "target": target}
         return preset("class", **settings, steps=self.steps, seed=self.seed)
@@ -72,7 +72,7 @@ def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list
 class Store:
     """The folder of weights and metrics, with the data for training and validation.
 
-    Stored weights and metrics that were made from other data are made again.
+    Stored weights and metrics that were computed from other data are computed again.
 
     Args:
         folder: where weights and metrics are kept.
@@ -103,7 +103,7 @@ class Store:
         return self.folder / f"{job.stem}.safetensors"
 
     def adapter(self, job: Job) -> nma.Adapter | None:
-        """Returns the trained adapter of a job, or None if no adapter with the job's settings and data exists."""
+        """Returns the stored adapter of a job, or None if no adapter with the job's settings and data is stored."""
         path = self.weights(job)
         if not path.exists():
             return None
@@ -112,7 +112,7 @@ class Store:
         return adapter if all(found.get(k) == v for k, v in wanted.items()) else None
 
     def train(self, job: Job) -> nma.Adapter:
-        """Returns the adapter of a job, and trains it if it does not exist, from its checkpoint if possible."""
+        """Returns a job's adapter. If the adapter is not stored, trains it, from its checkpoint if there is one."""
         done = self.adapter(job)
         if done:
             return done
@@ -130,8 +130,8 @@ class Store:
         """Returns the mean metrics of an adapter on the validation set, from the stored metrics if they exist."""
 
         def measure() -> dict[str, float]:
-            # With 16 directions, `figures` uses a quarter of the points of `nma.evaluate_adapter`, and returns a log
-            # loss that is .00003 larger for all variants.
+            # With 16 directions, `common.figures` uses a quarter of the points that `nma.evaluate_adapter` uses. The
+            # log loss is then .00003 larger for all variants.
             found = common.figures(adapter, self.validation, directions=16)
             return {name: round(value, 7) for name, value in mean_metrics(found).items()}
 
