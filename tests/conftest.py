@@ -11,8 +11,8 @@ from material_cases import PLAIN
 
 from nma import cli, llvm
 
-# Tests keep compiled code in a cache of their own, apart from the user's. All test processes share this cache, and
-# later test runs use it again. Each folder in the cache is named by the digest of the sources that were compiled.
+# Tests keep compiled code in a cache of their own, apart from the user's. All test processes and all test runs share
+# this cache. Each folder in the cache is named by the digest of the sources that were compiled.
 CACHE = Path(__file__).parents[1] / "build/tests"
 os.environ["XDG_CACHE_HOME"] = str(CACHE)
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE / "jax")

@@ -11,7 +11,7 @@ from nma.native.runtime import available
 from nma.target import Principled
 
 HERE = Path(__file__).parent
-# The count of numbers of a Principled BRDF. Its colour is one field of three numbers.
+# The count of numbers in a Principled BRDF. The colour is one field of `Principled` but has three numbers.
 PRINCIPLED_SIZE = len(Principled._fields) + 2
 FLAGS = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", f"-I{HERE.parent / 'runtime'}"]
 

@@ -97,8 +97,8 @@ def close(a, b, rtol=1e-4, atol=1e-6):
 def test_values_are_those_of_the_adapter(weights, make):
     """The BSDF has the values and densities that NumPy computes from the adapter.
 
-    The mean relative error is below 1e-5 for textured materials. For untextured materials it is only below 2e-4,
-    because an untextured material interpolates the parameters of its target from precomputed curves.
+    The mean relative error is below 1e-5 for textured materials. For untextured materials, the limit is 2e-4, because
+    an untextured material interpolates the parameters of its target from precomputed curves.
     """
     bsdf, (si, rng) = mi.load_dict(make(weights)), interactions(2000)
     wo = mi.warp.square_to_uniform_hemisphere(drawn(rng)[1])
@@ -120,8 +120,8 @@ def test_values_are_those_of_the_adapter(weights, make):
 def test_every_variant_of_adapters_has_the_values_of_numpy(tmp_path, instances, directional):
     """The values of the BSDF and of the adapter in NumPy agree within 1 %.
 
-    The test covers adapters with several counts of instances, whose parameters depend on the view direction or are
-    constant.
+    The test covers several counts of instances, and target parameters that are constant or depend on the view
+    direction.
     """
     random_adapter(instances, directional, hidden="1x4").save(tmp_path / "w.safetensors")
     adapter, (si, rng) = Adapter.load(tmp_path / "w.safetensors"), interactions(500)

@@ -131,7 +131,7 @@ def test_loading_many_materials_leaves_memory_flat():
 
 @pytest.mark.parametrize("kind", [*BESIDE, "blendbsdf"])
 def test_frozen_functions_render_edited_values(adapter, kind):
-    """A frozen function renders edits made before its call, and edits that the function makes.
+    """A frozen function renders with parameter values that are set before the call or inside the function.
 
     The function is recorded at most twice.
     """

@@ -19,8 +19,8 @@ WRITERS = set(
     copytree copyfile copyfileobj copy2 move make_archive unpack_archive extract extractall
     urlretrieve FileHandler create_array""".split()
 )
-# Functions that write or rename files, but have names that methods of other objects also have. A module name of a
-# library is the name that its import gives it.
+# Functions that write or rename files, but have names that methods of other objects also have. The entries are full
+# names, which `imported` finds for names such as `np.save`.
 OF_MODULES = set(
     """numpy.save os.open os.replace os.link os.symlink shutil.copy io.FileIO
     json.dump pickle.dump marshal.dump tomli_w.dump yaml.dump shelve.open sqlite3.connect""".split()
@@ -45,7 +45,7 @@ def code() -> list[Path]:
 
 
 def imported(tree: ast.AST) -> dict[str, str]:
-    """Returns the full name of what each imported name stands for: numpy for `np`, shutil.copy for `copy`."""
+    """Returns the full name of each imported name, for example numpy for `np` and shutil.copy for `copy`."""
     found = {"np": "numpy"}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -79,7 +79,7 @@ def is_write(call: ast.Call, known: dict[str, str]) -> bool:
     last = called.rpartition(".")[2]
     if called in OF_MODULES or (last in WRITERS and "." in called):
         return True
-    if last == "save" and called.startswith("PIL."):  # methods `save` of this package call nma.files
+    if last == "save" and called.startswith("PIL."):  # other methods `save` are ours and use nma.files
         return True
     if last in ("open", "fdopen", "ZipFile", "TarFile", "GzipFile"):
         mode = [

@@ -31,8 +31,8 @@ MATERIAL = {
     "albedo": rgb(0.8, 0.4, 0.3),
     "sigma_t": 0.7,
 }
-# Each material has a dictionary of parameters. The tests compute the derivative with respect to each parameter, along
-# the direction that is given by the array.
+# Materials, each with a dictionary from parameters to directions. The tests differentiate pictures along these
+# directions.
 CASES = {
     "plain": (
         MATERIAL,

@@ -17,7 +17,7 @@ def test_both_orders_reflect_the_same_over_all_directions():
     """Swapping wi and wo does not change the integral of f cos(theta_i) cos(theta_o) over all pairs of directions.
 
     In each of the three channels, the means with and without swapping agree within four standard errors. The
-    false-alarm rate is 2e-4 in all.
+    false-alarm rate over all channels is 2e-4.
     """
     n, rng = 1 << 15, np.random.default_rng(1)
     both = reciprocity.pairs(random_adapter(), MATERIAL, np.sqrt(rng.random(n)), rng)

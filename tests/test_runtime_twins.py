@@ -1,4 +1,4 @@
-"""Compares code that is written by hand in Python with its twin, the same code written by hand in C++.
+"""Compares code that is written by hand in Python with its twin in C++, which is also written by hand.
 
 CONTRIBUTING.md lists all such twins.
 """
@@ -181,9 +181,9 @@ def test_curves_have_the_same_nodes(bridge):
 
 
 def test_curves_interpolate_every_number_between_two_nodes(bridge, tmp_path):
-    """A quarter of the way from one node to the next, all numbers and scales of the BRDF have changed by a quarter.
+    """At a quarter of the distance between two nodes, all numbers and scales of a BRDF have changed by a quarter.
 
-    The adapter is bounded and reflects more light than it receives, so its scales vary.
+    The scales vary, because the adapter would reflect more light than it receives if its target were not bounded.
     """
     params, rng = TARGETS["stretched"], np.random.default_rng(8)
     bright = Principled(Color(0.98, 0.95, 0.9), 0.9, 0.05, 1.0, 0.1, 0.9, 0.1, 0.5, 0.5)
@@ -219,7 +219,10 @@ def test_curves_interpolate_every_number_between_two_nodes(bridge, tmp_path):
 
 @pytest.mark.parametrize("instruction_set", available())
 def test_weights_are_rounded_to_the_nearest_bfloat16_and_ties_to_even(tmp_path, instruction_set):
-    """Each output of the network in this test is one weight. bfloat16 has 7 bits after the leading one."""
+    """Each output of the network in this test is one weight.
+
+    The significand of a bfloat16 has 7 bits after the leading one.
+    """
     step, size = 2.0**-7, output_size(2, TARGETS["principled"])
     given = 1.0 + step * np.array([0.5, 1.5, 2.5, 3.5, 0.499, 0.501, 1.499, 1.501, 1.0])
     wanted = 1.0 + step * np.array([0.0, 2.0, 2.0, 4.0, 0.0, 1.0, 1.0, 2.0, 1.0])
@@ -233,7 +236,7 @@ def test_weights_are_rounded_to_the_nearest_bfloat16_and_ties_to_even(tmp_path, 
 
 
 def test_the_albedo_is_the_mean_over_the_points_of_a_lattice():
-    """C++ has the steps of the lattice as numbers; Python computes them."""
+    """C++ contains the steps of the lattice as constants, and Python computes the same steps."""
     points, runtime, rng = 128, Runtime("layered3-3x32"), np.random.default_rng(9)
     params, wi = LAYERED3.sample(rng, 20), rows(random_directions(rng, 20)).astype(np.float32)
     brdfs, n = runtime.prepare(params, wi), np.arange(points) + 0.5
@@ -250,7 +253,10 @@ def test_a_brdf_has_the_size_that_the_readme_says(bridge):
 
 
 def test_a_brdf_for_c_is_hardly_larger_than_a_brdf(bridge):
-    """Rows of BRDFs waste at most 16 bytes each. The compiler checks that they are not too small."""
+    """The C type of a BRDF is at most 16 bytes larger than the C++ type.
+
+    The compiler checks that the C type is not smaller.
+    """
     runtime = Runtime("layered3-3x32")
     assert 0 <= runtime._c.nma_brdf_size() - bridge.brdf_size() <= 16
 
