@@ -17,6 +17,16 @@ sigma_t = 0.25
 """
 
 
+# Pixels, and whether they are coloured. Rounding may make the channels of a grey pixel differ a little.
+GREYS = (
+    ((0.5, 0.5 + 0.8e-6, 0.5), False),
+    ((0.5, 0.5 + 1.3e-6, 0.5), True),
+    ((0.5, 0.5, 0.5 - 1.3e-6), True),
+    ((4.0, 4.0 - 3e-6, 4.0), False),
+    ((4.0, 4.0 - 5e-6, 4.0), True),
+)
+
+
 def write_image(path: Path, pixels: np.ndarray) -> Path:
     import mitsuba as mi
 

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from adapter_cases import random_adapter
+from material_cases import GREYS
 from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 from nma.images.io import write_exr, write_png
@@ -244,6 +245,10 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
         ({"sigma_t": bitmap(math.nan), "clamp": True}, "the texture of sigma_t at x=1, y=2: sigma_t is nan"),
         ({"sigma_t": coloured}, "the texture of sigma_t is coloured, and sigma_t is one number per pixel"),
         ({"sigma_t": coloured}, "choose a channel: set `sigma_t_channel` to r, g or b"),
+        *(
+            ({"type": "layered", "sigma_t": bitmap(pixel)}, "sigma_t is coloured" if refused else None)
+            for pixel, refused in GREYS
+        ),
         ({"sigma_t": coloured, "sigma_t_channel": "g"}, None),
         ({"sigma_t": bitmap([7, 0.5, 0]), "sigma_t_channel": "g"}, None),
         (

@@ -3,10 +3,14 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from material_cases import GREYS, write_image
 from PIL import Image
 
 import nma.render
+from nma import materials
+from nma.errors import NmaError
 from nma.jit import dr
+from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 PACKED = (200, 40, 0)  # the channels of a packed texture: occlusion, roughness, metalness
@@ -53,6 +57,24 @@ def test_other_choices_are_refused(kind, packed, channel, message):
     choice = {} if channel is None else {"alpha_bottom_channel": channel}
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict(bsdf(kind, alpha_bottom=packed, **choice))
+
+
+@pytest.mark.parametrize(("pixel", "coloured"), GREYS)
+def test_a_pixel_is_grey_up_to_rounding_in_scenes_and_in_files(pixel, coloured, material_file, tmp_path):
+    """test_scalar_inputs.py has the same cases for the C++ plugins."""
+    image = np.tile(np.float32(pixel), (2, 3, 1))
+    write_image(tmp_path / "image.exr", image)
+    material = materials.load(material_file("sigma_t = 0.25", "sigma_t = { texture = 'image.exr' }"))
+    loads = (
+        lambda: mi.load_dict(bsdf("layered", sigma_t=bitmap_texture(image))),
+        material.values["sigma_t"].read,
+    )
+    for load in loads:
+        if coloured:
+            with pytest.raises((RuntimeError, NmaError), match="coloured"):
+                load()
+        else:
+            load()
 
 
 def test_a_channel_is_refused_for_numbers_and_for_colours(packed):

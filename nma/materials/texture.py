@@ -15,7 +15,7 @@ from nma.images.io import CHANNELS, ImageError, coloured_layer, load_bitmap
 from nma.params import Param
 
 # Rounding may make the channels of a grey pixel differ by this much, or by this fraction of a pixel value above 1.
-_GREY = 1e-6
+GREY = 1e-6
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Texture:
         pixels = _converted(bitmap, self._format(bitmap.pixel_format()))
         if self.parameter.size == 3 or pixels.shape[2] == 1:
             return pixels
-        if self.channel is None and _is_coloured(pixels):
+        if self.channel is None and is_coloured(pixels):
             raise TextureError(
                 f"texture {self.path} is coloured, but {self.parameter.name} is one number; "
                 f"choose the channel {either(map(repr, CHANNELS))}, for example "
@@ -126,8 +126,8 @@ def _bitmap(path: Path) -> Any:
     return bitmap
 
 
-def _is_coloured(rgb: NDArray[np.float32]) -> bool:
+def is_coloured(rgb: NDArray[np.float32]) -> bool:
     """Whether the channels of any pixel differ by more than the rounding error."""
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)
-    return bool((spread > _GREY * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())
+    return bool((spread > GREY * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())

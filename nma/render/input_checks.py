@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nma.errors import ParamError, TextureError, either
 from nma.images.io import COLOUR, linear
-from nma.materials.texture import first_pixel
+from nma.materials.texture import first_pixel, is_coloured
 from nma.params import Param, Range
 
 
@@ -83,7 +83,7 @@ def _check_pixels(allowed: Allowed, pixels: NDArray, where: str, channel: int | 
     coloured = pixels.shape[-1] >= 3
     if coloured and channel is not None:
         pixels = pixels[..., channel : channel + 1]
-    elif size == 1 and coloured and np.ptp(pixels, axis=-1).max() > 1e-6:
+    elif size == 1 and coloured and is_coloured(pixels):
         raise TextureError(
             f"{where} is coloured, and {name} is one number per pixel; choose a channel: set `{name}_channel` to "
             f"{either(COLOUR)}"

@@ -213,12 +213,11 @@ private:
         const SourceParam& p = input.param;
         const auto& numbers = texels.numbers;
         const bool coloured = texels.channels >= 3, one = coloured && input.channel >= 0;
-        for (std::size_t k = 0; p.size == 1 && coloured && !one && k < numbers.size(); ++k)
-            if (nma::absolute(numbers[k] - numbers[k - k % texels.channels]) > 1e-6f)
-                Throw(
-                    "the texture of %s is coloured, and %s is one number per pixel; choose a channel: set `%s_channel` "
-                    "to r, g or b",
-                    p.name, p.name, p.name);
+        if (p.size == 1 && coloured && !one && !grey(texels))
+            Throw(
+                "the texture of %s is coloured, and %s is one number per pixel; choose a channel: set `%s_channel` to "
+                "r, g or b",
+                p.name, p.name, p.name);
         std::size_t first = numbers.size(), last = numbers.size(), bad = 0;
         const std::size_t start = one ? static_cast<std::size_t>(input.channel) : 0, step = one ? texels.channels : 1;
         for (std::size_t k = start; k < numbers.size(); k += step)
@@ -238,6 +237,16 @@ private:
                 ? "; its pixels are bytes, 0 to 1; with `format` \"variant\" a bitmap keeps floats, which can be edited"
                 : "";
         Throw("the texture of %s%s: %s%s", p.name, place, refusal(p, found), hint);
+    }
+
+    // Whether the channels of each pixel are equal up to rounding. Twin of `is_coloured` in nma/materials/texture.py.
+    static bool grey(const Texels& texels) {
+        for (std::size_t k = 0; k < texels.numbers.size(); ++k) {
+            const float first = texels.numbers[k - k % texels.channels];
+            if (nma::absolute(texels.numbers[k] - first) > nma::GREY * nma::maximum(nma::absolute(first), 1.0f))
+                return false;
+        }
+        return true;
     }
 
     bool allowed(const SourceParam& p, Float x) const {
