@@ -157,7 +157,8 @@ def _package(name: str) -> Any:
         return import_module(name)
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            f"comparing images needs {error.name}; in a checkout of this project run: pip install '.[compare]'"
+            f"comparing images needs the package {error.name}; "
+            "in a checkout of this project run: pip install '.[compare]'"
         ) from error
 
 

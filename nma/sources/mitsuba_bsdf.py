@@ -160,7 +160,7 @@ def choose_variant() -> Any:
     """The module `mitsuba` in a vectorised RGB variant. If no variant is set, sets the variant of Dr.Jit's backend."""
     import mitsuba
 
-    mi: Any = mitsuba  # Any, because Mitsuba's types change with the variant
+    mi: Any = mitsuba  # the type is Any, because Mitsuba's types change with the variant
     if mi.variant() is None:
         mi.set_variant("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb")
     if not mi.variant().endswith("_ad_rgb"):

@@ -87,7 +87,7 @@ def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
             names, weights = f["names"], f["weights"]
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; `nma data` says where to get NBRDF networks") from None
-    except Exception as e:  # any, since zipfile and zlib raise their own exceptions for damaged archives
+    except Exception as e:  # zipfile and zlib raise exceptions of their own, so all are caught
         raise SourceError(
             f"{path}: not a weights file of NBRDF networks (.npz with names and weights): {e}"
         ) from None
@@ -114,7 +114,7 @@ def _claims(path: Path) -> bool:
     try:
         with arrays(path) as f:
             return "weights" in f
-    except Exception:  # any, since zipfile raises its own exceptions for damaged archives
+    except Exception:  # zipfile raises exceptions of its own, so all are caught
         return False
 
 

@@ -195,7 +195,7 @@ class Dataset:
             if not self._has(i):
                 raise DatasetError(
                     f"{self.path}: material {i} is missing ({len(self.missing())} are missing in all); "
-                    f"run `nma dataset {self.settings.class_name} {self.path}` with the same settings to complete it"
+                    f"run `nma dataset {self.settings.class_name} {self.path}` with the same settings"
                 )
             try:
                 values[row] = self._table[int(i)]

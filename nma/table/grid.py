@@ -114,7 +114,7 @@ class Tables:
             )
         errors = [t.error for t in parts if t.error is not None]
         if errors and len(errors) < len(parts):
-            raise TableError("some of the tables have standard errors, others have none")
+            raise TableError("tables with and without standard errors cannot be joined")
         return Tables(
             np.concatenate([t.params for t in parts]),
             np.concatenate([t.values for t in parts]),
@@ -155,7 +155,7 @@ class Tables:
             raise TableError(
                 f"{path}: not a reference file (.npz with the arrays params, table and walks): {e}"
             ) from None
-        except Exception as e:  # any, since zipfile and zlib raise their own exceptions for damaged archives
+        except Exception as e:  # zipfile and zlib raise exceptions of their own, so all are caught
             raise TableError(f"{path}: damaged archive: {e}") from None
         _check_arrays(path, params, values, walks, error)
         walks = np.broadcast_to(walks, len(params)).astype(np.int64)

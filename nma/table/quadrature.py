@@ -70,7 +70,7 @@ def bin_points(
     grid: Grid = ISOTROPIC,
     finest: float = FINEST,
 ) -> Points:
-    """Maps the point `u` of the unit cube to the bin (theta_i, theta_o, phi) = (i, o, p), given as floats."""
+    """Maps the point `u` of the unit cube to directions in the bin (theta_i, theta_o, phi) = (i, o, p)."""
     near_mu, near_phi = _scales(i, grid, finest)
     mu_i, mu_o, weight = _cosines(i, o, u[0], u[1], grid, near_mu)
     # psi is the azimuth between wo and the mirror direction. Points are denser around psi = 0.
@@ -89,7 +89,7 @@ def anisotropic_bin_points(
     grid: Grid,
     finest: float = FINEST,
 ) -> Points:
-    """Maps the point `u` of the unit cube to the bin (theta_i, phi_i, theta_o, phi_o) = (i, a, o, b)."""
+    """Maps the point `u` of the unit cube to directions in the bin (theta_i, phi_i, theta_o, phi_o) = (i, a, o, b)."""
     near_mu, near_phi = _scales(i, grid, finest)
     mu_i, mu_o, weight = _cosines(i, o, u[0], u[1], grid, near_mu)
     # psi is the azimuth of wo minus the azimuth of wi minus pi, so psi is 0 at the mirror direction, where points are
@@ -144,7 +144,7 @@ def _pair(
 
 
 def _directions(mu_i: Float, mu_o: Float, psi: Float) -> tuple[Vec3, Vec3]:
-    """wi at azimuth 0 and wo at azimuth pi - psi.
+    """Returns wi at azimuth 0 and wo at azimuth pi - psi.
 
     The formulas are chosen such that half vectors near the normal are precise.
     """

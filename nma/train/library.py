@@ -25,7 +25,8 @@ from nma.train.loss import bin_means, brdf_of, distance, loss
 from nma.train.recipe import Recipe
 from nma.train.run import adapter_of, initial_layers
 
-# With this recipe, a library of a hundred materials takes 20 minutes or less on two cores, including the tables.
+# With this recipe, a library of a hundred materials needs 20 minutes or less on two cores. This time includes the
+# tabulation of the materials.
 RECIPE = Recipe(
     network="3x32",
     encoding="raw",

@@ -21,7 +21,7 @@ from nma.train.batches import batches
 from nma.train.loss import loss
 from nma.train.recipe import Recipe
 
-# The arrays to train, in any JAX tree. For an adapter, the tree is `nma.network.Layers`.
+# The arrays to train, as a JAX tree of any structure. For an adapter, the tree is `nma.network.Layers`.
 Weights = Any
 # A named tuple of arrays, such as `nma.train.batches.Batch`.
 Batch = Any

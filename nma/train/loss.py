@@ -49,7 +49,7 @@ def bin_means(brdf: Brdf, batch: Batch, recipe: Recipe) -> jax.Array:
 
 
 def view(batch: Any) -> Vec3:
-    """wi of each row, (rows,)."""
+    """The direction wi of each row, (rows,)."""
     sin = jnp.sqrt(1.0 - batch.mu * batch.mu)
     return Vec3(sin * jnp.cos(batch.phi), sin * jnp.sin(batch.phi), batch.mu)
 
