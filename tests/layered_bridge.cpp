@@ -38,8 +38,8 @@ Vec view(int row, int rows, layered::Random& random) {
     return {nma::safe_sqrt(1.0f - z * z), 0.0f, z};
 }
 
-// Samples a direction from the material's sampling density. Returns a walk with this direction, whose throughput is an
-// estimate of the value divided by the density.
+// Samples a direction from the material's sampling density, and returns a walk that leaves in this direction. The
+// throughput of the walk is an estimate of the value divided by the density.
 layered::Walk estimate(const layered::Stack& stack, const Vec& wi, layered::Random& random) {
     const layered::Density density(stack, wi);
     const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();

@@ -71,7 +71,7 @@ def random_directions(rng: np.random.Generator, n: int) -> Vec3:
 def horizon_pairs():
     """Returns pairs of directions, wi (n, 3) and wo (n, 3), of which at least one is at or below the horizon.
 
-    The other direction of a pair may be anywhere. Some pairs are opposite directions, and some have equal directions.
+    In some pairs, the two directions are equal or opposite.
     """
     z = np.array([1.0, 0.5, 1e-9, 1e-20, 0.0, -0.0, -1e-20, -1e-9, -0.5, -1.0])
     one = np.stack([np.sqrt(1.0 - z * z), 0.0 * z, z], axis=-1)

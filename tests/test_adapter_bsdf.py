@@ -1,4 +1,6 @@
-"""The Mitsuba BSDF `nma`: its values are those of the adapter, its methods agree, and it checks inputs and edits."""
+"""The Mitsuba BSDF `nma`: it has the adapter's values, its methods agree with each other, and it checks inputs and
+edits.
+"""
 
 import json
 import math

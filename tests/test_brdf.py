@@ -1,6 +1,6 @@
 """Adapters of every kind prepare a BRDF whose methods agree for every azimuth of the view.
 
-Where lobes are stretched in the plane of incidence, the BRDF includes the frame of this plane.
+If lobes are stretched in the plane of incidence, the BRDF includes the frame of this plane.
 """
 
 import math
@@ -78,7 +78,7 @@ def pairs(n=2000):
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", KINDS)
 def test_at_the_horizon_and_below_all_is_zero_without_a_warning(kind, precision):
-    """Values and densities are 0 if `wi` or `wo` is at the horizon or below, also straight below."""
+    """Values and densities are 0 if `wi` or `wo` lies at or below the horizon."""
     wi, wo = (Vec3(*w.astype(precision).T) for w in horizon_pairs())
     brdf = prepared(kind, wi)
     assert not np.any(stacked(brdf.eval(wi, wo))) and not np.any(brdf.pdf(wi, wo))

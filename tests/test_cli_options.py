@@ -120,7 +120,10 @@ def test_the_version_is_printed(nma):
 
 
 def test_a_terminated_command_deletes_its_partial_files(tmp_path):
-    """A queue or a system that shuts down sends SIGTERM. The command ends as on Ctrl-C."""
+    """If a command gets the signal SIGTERM, it deletes partly written files and ends, as on Ctrl-C.
+
+    A job queue or a system that shuts down sends this signal.
+    """
     code = """
 import sys, time
 from nma import cli, files, materials

@@ -67,7 +67,8 @@ def halves(name, slope):
 def fine_means(adapter, bins, points=1 << 11, repeats=6):
     """Returns the adapter's mean value in each of `bins` (n, 3), and the standard errors of the means, both (n, 3).
 
-    Each mean is over many points, which concentrate near peaks. The adapter is prepared for the wi of every point.
+    Each mean is over many points, which concentrate near peaks. The adapter's BRDF is computed for the wi of every
+    point.
     """
     Float = dr.auto.Float
     means = []

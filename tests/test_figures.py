@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 EXPERIMENTS = sorted(script.parent.name for script in (ROOT / "figures").glob("*/run.py"))
 
 NEED_DATA = {"library"}
-# Optimised compilation takes longer than the few training steps of a quick form.
+# Optimisations are off, because optimised compilation takes longer than the few training steps of a quick form.
 ENVIRONMENT = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 
 

@@ -214,7 +214,7 @@ def xml(path, rho):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with three Mitsuba BSDFs, and with a page and a folder that are no materials."""
+    """A folder with three Mitsuba BSDFs, and with a README and a subfolder that are not materials."""
     folder = tmp_path_factory.mktemp("materials")
     for name, rho in zip(NAMES, COLOURS[:3], strict=True):
         xml(folder / f"{name}.xml", rho)

@@ -109,7 +109,7 @@ def test_a_material_becomes_a_dictionary_for_either_bsdf():
 
 @pytest.mark.parametrize("model", ["nma", "layered"])
 def test_images_of_a_material_repeat_as_often_as_its_file_says(model, tmp_path):
-    """With `uv_scale = 3` an image repeats three times along u.
+    """With `uv_scale = 3`, an image repeats three times along u.
 
     The scene gives the material by the name of its file, or as a dictionary.
     """

@@ -46,7 +46,7 @@ def tables():
     ("law", "kind"), [("crowded", "principled"), ("uniform", "principled"), ("crowded", "stretched")], ids=str
 )
 def test_bin_means_in_jax_equal_the_tables_of_the_evaluation(tables, law, kind):
-    """Training in JAX and evaluation in Dr.Jit average the same target to the same means over bins.
+    """Training in JAX and evaluation in Dr.Jit compute the same means over bins from the same target.
 
     Training and evaluation use different code and different points. A failure means that training and evaluation
     compute different values from the same target.

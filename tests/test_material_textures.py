@@ -64,7 +64,7 @@ def test_only_the_chosen_channel_must_lie_in_the_range(material_file, tmp_path):
 
 
 def test_a_coloured_image_for_one_number_is_refused_unless_a_channel_is_chosen(material_file, tmp_path):
-    """The error message says how to choose a channel of the coloured image.
+    """If a scalar parameter gets a coloured image, the error message says how to choose one channel of the image.
 
     A grey image with three equal channels is accepted without a choice.
     """

@@ -108,7 +108,7 @@ def test_the_layout_is_merls(planes, tmp_path):
 
 
 def test_an_entry_is_the_value_in_the_middle_of_its_cell(planes):
-    """In the middle of a cell, f is the cell's entry times the scale.
+    """In the middle of a cell, f is the cell's entry times the scale of the colour channel.
 
     The reader published with the MERL database returns the same f, although it rounds angles down to an entry instead
     of interpolating.

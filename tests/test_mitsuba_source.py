@@ -171,10 +171,11 @@ def test_variants_that_cannot_serve_are_refused():
 
 
 def nodes(fields, k=0):
-    """Returns (wi, wo, f cos(theta_o)) at the nodes of a material's grid, for the azimuth of incidence number k.
+    """Returns (wi, wo, f cos(theta_o)) at the nodes of a material's grid, for the azimuth of incidence with index k.
 
     The nodes are the points of the grid, warped by the distribution of visible normals. The value at a node is the
-    grid's entry, times the distribution of normals, divided by the projected area (Dupuy and Jakob 2018, section 4).
+    grid's entry, times the distribution of normals, divided by four times the projected area (Dupuy and Jakob 2018,
+    section 4).
     """
     phi, theta, size = float(fields["phi_i"][k]), fields["theta_i"], fields["rgb"].shape[-1]
     inner = np.arange(1, size - 1)

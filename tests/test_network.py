@@ -63,7 +63,8 @@ def test_a_network_is_its_matrices(blocks, monkeypatch):
 def test_initial_layers_have_the_spread_of_their_law():
     """Initial weights have the standard deviation of He et al. 2015.
 
-    With this standard deviation, the outputs of a layer are about as large as its inputs.
+    With this standard deviation, the outputs of a layer are about as large as its inputs. The weights of the last layer
+    are ten times smaller.
 
     The last bias is the given array, and equal seeds give equal layers.
     """

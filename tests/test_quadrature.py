@@ -177,7 +177,10 @@ def graded(n):
 
 
 def peaked(low, high, scale, n):
-    """Nodes and weights of a quadrature on low .. high whose nodes get denser around 0: x = scale sinh t."""
+    """Nodes and weights of a quadrature on low .. high whose nodes get denser around 0.
+
+    The nodes are scale sinh(t) for the nodes t of a Gauss-Legendre quadrature.
+    """
     x, w = np.polynomial.legendre.leggauss(n)
     start, stop = np.arcsinh(low / scale), np.arcsinh(high / scale)
     t = start + 0.5 * (x + 1.0) * (stop - start)

@@ -68,7 +68,7 @@ def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, 
 
 
 def unflat(columns):
-    """Inverts `flat`: makes a blend of two instances from its columns."""
+    """Inverts `flat`: makes a blend of two instances from the columns of the array."""
     instances = []
     for k in range(2):
         p = columns[PRINCIPLED_SIZE * k : PRINCIPLED_SIZE * (k + 1)]
@@ -159,8 +159,8 @@ def test_an_adapter_evaluates_like_the_package():
 def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hidden):
     """The runtime and the package compute the same values of a measured material, within 2e-3.
 
-    The class has no parameters, so that cos(theta_i) is the only input of the network. Lobes are stretched in the plane
-    of incidence, flattened and faded.
+    The class has no parameters, so that cos(theta_i) is the only input of the network. The target has all parameters of
+    a measured material, including `anisotropic`, `flatness` and `fade`.
     """
     rng, size = np.random.default_rng(14), target.output_size(2, target.MEASURED_PARAMS)
     layers = network.init(rng, [1, *hidden, size], rng.normal(size=size))

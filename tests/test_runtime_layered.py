@@ -134,7 +134,8 @@ def test_samples_are_those_of_the_package(bridge):
             expected = np.stack([x.numpy() for x in drawn], axis=-1)
             found = bridge("layered_sample", (vector(values), wi, u), (len(u), 7))
             valid = expected[:, 2] > 0
-            # Rounding may choose the other lobe near a border, or change whether a sample lies above the horizon.
+            # Near the border between two lobes, rounding may choose the other lobe. Near the horizon, it may change
+            # whether a sample is valid.
             assert (valid == (found[:, 3] > 0)).mean() > 0.998
             assert (np.abs(found[:, :3] - expected).max(axis=1) < 1e-3)[valid].mean() > 0.998
 
@@ -230,7 +231,10 @@ def test_samples_follow_the_density(bridge):
 
 @pytest.mark.parametrize("case", [*CASES, "narrow"])
 def test_weights_of_samples_have_the_mean_of_walks(bridge, case):
-    """Mean sample weights and mean walks give the same directional albedo (Z-tests, false-alarm rate 1e-3 in all)."""
+    """Mean sample weights and mean throughputs of walks give the same directional albedo.
+
+    The Z-tests have a false-alarm rate of 1e-3 in all.
+    """
     n, most = 200_000, limit(3 * len(COSINES))
     about = vector(CASES.get(case, NARROW))
     for mu in COSINES:

@@ -62,7 +62,7 @@ def test_the_example_compiles_and_runs(compiler, tmp_path):
 
 
 def test_the_example_of_the_simulated_material_agrees_with_itself(tmp_path):
-    """The four estimates of the same light in the example agree within 4.5 standard errors.
+    """The example estimates the reflected light in four ways, and the estimates agree within 4.5 standard errors.
 
     A false alarm happens in about one of ten thousand runs. The estimate that combines walks and evaluation has a
     smaller error than walks alone or evaluation alone.

@@ -27,7 +27,7 @@ from nma.target.decode import TARGETS, decode, encode, output_size
 
 ROOT = Path(__file__).parent.parent
 CASES = 4000
-# For each encoding that is not named like a class, the class whose parameters the tests encode.
+# Encodings that do not have the name of a class, each with the class whose parameters the tests encode.
 CLASS_OF = {"direction": MEASURED, "azimuth": MEASURED, "raw": LIBRARY}
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -97,7 +97,10 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
 @pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("name", TARGETS)
 def test_at_the_horizon_and_below_all_is_zero(tmp_path, name, bounded):
-    """Python has the same rule: test_brdf.py checks it."""
+    """In C++, values and densities are 0 at and below the horizon.
+
+    tests/test_brdf.py tests the same in Python.
+    """
     kind, rng = "azimuth" if name == "anisotropic" else "direction", np.random.default_rng(3)
     size, inputs = output_size(2, TARGETS[name]), encoding.size(kind, MEASURED, True)
     path = saved(

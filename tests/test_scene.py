@@ -158,7 +158,7 @@ def test_wrong_options_are_refused(options):
 
 
 def test_unreadable_environment_maps_are_refused_by_name(tmp_path):
-    """An environment map that is no image or contains NaN is refused before rendering."""
+    """An environment map that is not an image or contains NaN is refused before rendering."""
     sky = np.ones((4, 8, 3), np.float32)
     sky[1, 2] = np.nan
     (tmp_path / "text.exr").write_text("sky")

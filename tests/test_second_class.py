@@ -1,4 +1,4 @@
-"""To add a class of materials, the code needs only one file and one line in a registry.
+"""A new class of materials needs only one file and one line in a registry.
 
 The new file contains the parameters of the class and its source. The tests use the example of docs/how-it-is-built.md.
 """

@@ -28,7 +28,7 @@ GOLD = materials.load("gold-red-lacquer")
 
 
 def of_gold(**record):
-    """Returns an adapter with random weights whose record names the material gold under red lacquer."""
+    """Returns an adapter with random weights, with a record of the material "gold under red lacquer"."""
     adapter = random_adapter(hidden="1x8", name="direction")
     return replace(adapter, training={"material": GOLD.name, "params": GOLD.vector().tolist(), **record})
 

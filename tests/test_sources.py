@@ -105,7 +105,7 @@ def test_every_format_with_measurements_tells_which_a_file_is_of(ending):
 
 
 def test_a_new_format_is_a_file_and_a_line(monkeypatch, tmp_path):
-    """Once a file format is registered, files of the format can be read and collected, and error messages list it."""
+    """Files of a registered format can be read and collected, and error messages list the format."""
     module = types.ModuleType("nma.sources.grey")
     module.FORMAT = Format("Grey", lambda path: Coating(alpha=float(path.read_text())))
     monkeypatch.setitem(sys.modules, "nma.sources.grey", module)
