@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from nma import params, sources
 from nma.adapter import adapter, encoding, weights
-from nma.materials import texture
 from nma.params import ParamSpace
 from nma.sources import layered, layered_eval
 from nma.target import principled
@@ -21,7 +20,6 @@ _GENERAL = (
     (weights, ("FORMAT", "MAX_DEPTH")),
     (adapter, ("SAME",)),
     (params, ("ROUNDING",)),
-    (texture, ("GREY",)),
     (encoding, ("GRAZING", "MIN_COS_T")),
 )
 _LAYERED = (

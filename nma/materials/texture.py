@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 
 from nma.errors import TextureError, either, one_line
 from nma.images.io import CHANNELS, ImageError, coloured_layer, load_bitmap
-from nma.params import Param
-
-# Rounding may make the channels of a grey pixel differ by this much, or by this fraction of a pixel value above 1.
-GREY = 1e-6
+from nma.params import ROUNDING, Param
 
 
 @dataclass(frozen=True)
@@ -127,7 +124,7 @@ def _bitmap(path: Path) -> Any:
 
 
 def is_coloured(rgb: NDArray[np.float32]) -> bool:
-    """Whether the channels of any pixel differ by more than the rounding error."""
+    """Whether the channels of any pixel differ by more than `ROUNDING`, or by this fraction of a value above 1."""
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)
-    return bool((spread > GREY * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())
+    return bool((spread > ROUNDING * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())

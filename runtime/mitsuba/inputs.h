@@ -243,7 +243,7 @@ private:
     static bool grey(const Texels& texels) {
         for (std::size_t k = 0; k < texels.numbers.size(); ++k) {
             const float first = texels.numbers[k - k % texels.channels];
-            if (nma::absolute(texels.numbers[k] - first) > nma::GREY * nma::maximum(nma::absolute(first), 1.0f))
+            if (nma::absolute(texels.numbers[k] - first) > nma::ROUNDING * nma::maximum(nma::absolute(first), 1.0f))
                 return false;
         }
         return true;

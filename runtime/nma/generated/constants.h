@@ -12,8 +12,6 @@ constexpr int MAX_DEPTH = 32;
 constexpr float SAME = 1e-05f;
 // Constants of nma/params.py
 constexpr float ROUNDING = 1e-06f;
-// Constants of nma/materials/texture.py
-constexpr float GREY = 1e-06f;
 // Constants of nma/adapter/encoding.py
 constexpr float GRAZING = 0.1045f;
 constexpr float MIN_COS_T = 0.05f;
