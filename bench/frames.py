@@ -89,7 +89,7 @@ def in_turns(scenes: Mapping[str, Mapping[str, Any]], spp: int, seeds: Iterable[
 def _turns(
     scenes: Mapping[str, Mapping[str, Any]], spp: int
 ) -> Callable[[str, int], tuple[Array, float, float]]:
-    """Returns a function of a scene's name and a seed. The function returns the result of `timed`."""
+    """Returns a function that takes a scene's name and a seed, renders a frame, and returns the result of `timed`."""
     import mitsuba as mi
 
     if mi.variant() == SCALAR:

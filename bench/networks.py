@@ -3,11 +3,11 @@
 python -m bench.networks [--scene lights] [--networks 1x16 3x32 3x64 5x64] [--size 160] [--spp 48] [--runs 5]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-A vectorised renderer compiles a whole frame into one kernel, so a profiler cannot separate the network's time. This
-bench therefore renders a textured material with adapters that differ only in the size of their network; the weights are
-random. The bench fits a straight line to the time per frame as a function of multiply-adds. The line's value at 0
-multiply-adds is the time of everything except the network. The simulation and Mitsuba's `principled` are rendered for
-comparison. Every run renders one frame with each BSDF; the reported times are medians over the runs.
+A vectorised renderer compiles a whole frame into one kernel, so a profiler cannot measure the time of the network
+alone. This bench therefore renders a textured material with adapters that differ only in the size of their network; the
+weights are random. The bench fits a straight line to the time per frame as a function of multiply-adds. The line's
+value at 0 multiply-adds is the time of everything except the network. The simulation and Mitsuba's `principled` are
+rendered for comparison. Every run renders one frame with each BSDF; the reported times are medians over the runs.
 
 Writes networks.json and networks.png.
 """

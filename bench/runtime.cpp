@@ -24,8 +24,7 @@ volatile float sink;
 
 double seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
-// Calls the function `all`, which evaluates every query once, several times. Returns the shortest time in nanoseconds
-// per query.
+// Calls `all` several times; each call evaluates every query once. Returns the shortest time, in nanoseconds per query.
 template <class F>
 double best(F all, int repetitions = REPETITIONS) {
     double least = 1e30;

@@ -5,11 +5,11 @@ python -m bench.scalar [--scene sphere|environment|preview|lights] [--materials 
 
 For each material, every run renders one frame with each BSDF, so that other load on the machine slows all BSDFs alike.
 The time of a BSDF is the median over its frames, rendered on all cores. bench/frames.py defines variance, error and
-efficiency. The error is measured for the first --error materials only. All results are ratios to `layered`, as
-geometric means over the materials. A time below 1 is faster than the simulation, and an efficiency above 1 is better.
-An adapter marked `online` runs the network at every shading point, an adapter marked `curves` runs the network only
-when the scene is loaded. `principled` and `diffuse` show other materials. `principled` measures the time of a
-production BSDF, and `diffuse` measures the time of everything except the material.
+efficiency. The error is measured for the first --error materials only. All results are divided by the results of
+`layered`; the table shows geometric means over the materials. A time below 1 is faster than the simulation, and an
+efficiency above 1 is better. An adapter marked `online` runs the network at every shading point, an adapter marked
+`curves` runs the network only when the scene is loaded. `principled` and `diffuse` show other materials. `principled`
+measures the time of a production BSDF, and `diffuse` measures the time of everything except the material.
 
 Writes scalar.json and scalar.png for the default scene, and scalar-SCENE.json and scalar-SCENE.png for another scene.
 """

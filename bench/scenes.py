@@ -74,7 +74,8 @@ def online(bsdf: Bsdf, precision: str = "compact") -> dict[str, Any]:
     """Returns the BSDF `nma` with the setting that makes the BSDF run its network at every shading point.
 
     In `scalar_rgb`, the setting is the option `online`. In Mitsuba's other variants, the network runs at every shading
-    point if any parameter has a texture. There a BSDF without a texture for sigma_t gets a constant texture.
+    point if any parameter has a texture. In these variants, a BSDF without a texture for sigma_t gets a constant
+    texture.
     """
     import mitsuba as mi
 

@@ -6,11 +6,11 @@ python -m bench.settings [--variant scalar_rgb llvm_ad_rgb] [--scene preview lig
 Materials are untextured or textured. Untextured materials are drawn from the paper's ranges, and no adapter was trained
 on these materials. For untextured materials, the adapters interpolate curves over the viewing angle. Textured materials
 are those of bench/scenes.py; for textured materials, the adapters run the network at every shading point. All results
-are ratios to `layered`, as geometric means over the materials. bench/frames.py defines variance, error and efficiency.
-The verdict names the BSDF with the higher efficiency by error, or "even" if the two efficiencies differ by less than
-10 %. `doubt` is the relative standard error of the efficiency by error, estimated over the runs. `doubt` is large under
-sun and lamps, where a few bright pixels hold most of the noise. `principled` shows another material, so its error is
-not computed.
+are divided by the results of `layered`; the table shows geometric means over the materials. bench/frames.py defines
+variance, error and efficiency. The verdict names the BSDF with the higher efficiency by error, or "even" if the two
+efficiencies differ by less than 10 %. `doubt` is the relative standard error of the efficiency by error, estimated over
+the runs. `doubt` is large under sun and lamps, where a few bright pixels hold most of the noise. `principled` shows
+another material, so its error is not computed.
 
 Every run renders one frame with each BSDF. In a vectorised renderer, the measured time excludes the compilation of
 kernels. But the measured time includes the tracing of the BSDF in Python, about 0.05 s per frame for the larger

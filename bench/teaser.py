@@ -5,9 +5,9 @@ python -m bench.teaser [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3]
 
 The scene has three shader balls with textured materials, so the network runs at every shading point. A table below the
 pictures shows, for simulation and adapter, the median time of a frame, the variance, the squared error and the SMAPE
-against the converged picture. The table's last row shows the adapter's values and efficiencies relative to the
-simulation. bench/frames.py defines variance, squared error and efficiency. The parts of the converged picture are kept
-in out/bench/references, so a killed run continues where it stopped.
+against the converged picture. The table's last row shows the adapter's results divided by the simulation's, and the
+adapter's efficiencies relative to the simulation. bench/frames.py defines variance, squared error and efficiency. The
+parts of the converged picture are kept in out/bench/references, so a killed run continues where it stopped.
 
 Writes teaser.json and teaser.png.
 """
@@ -88,7 +88,8 @@ def sheet(
 
 
 def table(rows: Figures, ratios: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Returns the table below the pictures: the results of both BSDFs, and the adapter's ratios to the simulation."""
+    """Returns the table below the pictures: the results of both BSDFs, and the adapter's results relative to
+    `layered`."""
     headings = ("", "time", "variance", "squared error", "SMAPE", "efficiency by variance", "by error")
     keys = ("time", "variance", "error", "smape", "efficiency by variance", "efficiency by error")
     shapes = ("{:.2f} s", "{:.2e}", "{:.2e}", "{:.3f}")

@@ -29,8 +29,7 @@ def describe(material: Material) -> str:
 
 
 def worst_to_median(errors: ArrayLike, count: int) -> NDArray[np.intp]:
-    """Returns indices of `count` errors (or of fewer, if there are few), at even steps from the largest to the
-    median."""
+    """Returns `count` indices at even steps from the largest error to the median, or fewer if errors are few."""
     worst_first = np.argsort(errors)[::-1]
     return worst_first[np.unique(np.linspace(0, len(worst_first) // 2, count).astype(int))]
 

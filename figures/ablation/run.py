@@ -4,7 +4,7 @@
 
 Trains on a dataset of 8000 materials, which `nma dataset layered3 FOLDER --seed 1` makes. Evaluates on every third
 material of the sets "range" and "metals" (figures/common.py). The metrics of finished trainings are kept in
-out/figures/ablation, so a run that starts again after an interruption does not repeat these trainings.
+out/figures/ablation, so a killed run does not repeat these trainings when it is started again.
 """
 
 from __future__ import annotations

@@ -163,8 +163,7 @@ def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]
 
 
 def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[str, Any]:
-    """Learns the latent code of a new material. Returns its log loss, the library's most similar material, and the
-    seconds."""
+    """Learns the latent code of a new material. Returns log loss, most similar material and seconds."""
     began = time.perf_counter()
     found = training.encode(library, tables, recipe=replace(training.ENCODING, steps=steps))
     row = {"name": name, "log_loss": round(found.log_loss, 6), "nearest": found.nearest}
@@ -176,7 +175,7 @@ def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[st
 def unseen(
     members: Sequence[Member], tables: Tables, recipe: Recipe, arguments: argparse.Namespace, kept: Path
 ) -> list[dict[str, Any]]:
-    """Trains a second library without --held-out of the materials, and then learns latent codes for these materials."""
+    """Trains a second library on all but --held-out materials, and then learns latent codes for the others."""
     if not arguments.held_out:
         return []
     out = np.linspace(0, len(members), arguments.held_out, endpoint=False).astype(int) + 1

@@ -227,8 +227,8 @@ def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.
     """Returns tables in Markdown: all metrics at the largest number of samples, then FLIP by samples per pixel."""
     most = arguments.spp
     lines = [
-        f"{arguments.materials} materials, {arguments.resolution} x {arguments.resolution} pixels; reference:"
-        f" {arguments.reference_spp} samples per pixel.",
+        f"The first table shows means over {arguments.materials} materials, with {arguments.resolution} x "
+        f"{arguments.resolution} pixels. The reference has {arguments.reference_spp} samples per pixel.",
         "",
         "| | samples | " + " | ".join(METRICS) + " |",
         "|---|---|" + "---|" * len(METRICS),
@@ -241,7 +241,11 @@ def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.
     ]
     for metric, (value, ratio) in PAPER.items():
         steps = levels(most)
-        lines += ["", f"{metric} by samples per pixel (paper: {value}, {ratio} of the variant single):", ""]
+        lines += [
+            "",
+            f"Mean {metric} by samples per pixel (paper: {value}, which is {ratio} of the variant single):",
+            "",
+        ]
         lines += [
             "| | " + " | ".join(map(str, steps)) + " | of single |",
             "|---|" + "---|" * (len(steps) + 1),

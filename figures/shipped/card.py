@@ -25,7 +25,7 @@ LIMITS = """\
   parameters outside these ranges, or clamps parameters to the ranges on request.
 - The target's parameters depend on the view direction, so the BRDF is not reciprocal. Light tracing and bidirectional
   methods converge to a picture that differs from path tracing, unless they
-  [prepare the blend for the camera's side](../../docs/mitsuba.md#reciprocity).
+  [evaluate the network for the direction to the camera](../../docs/mitsuba.md#reciprocity).
 - The reflection is isotropic, and its lobes have the shapes of the Principled BRDF. The adapter has errors where a
   material's lobes have other shapes, as in the worst materials above.
 """

@@ -23,7 +23,7 @@ REFERENCE_SEED, NOISE_SEED, ADAPTER_SEED = 1, 2, 3
 
 
 class View(NamedTuple):
-    """Settings of the pictures of the first `materials` materials of the validation set.
+    """Settings for rendering the first `materials` materials of the validation set.
 
     Pictures have `size` x `size` pixels, with `spp` samples per pixel for adapters and `reference_spp` for the
     simulation.

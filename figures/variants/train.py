@@ -130,8 +130,8 @@ class Store:
         """Returns the mean metrics of an adapter on the validation set, from the stored metrics if they exist."""
 
         def measure() -> dict[str, float]:
-            # With 16 directions, `common.figures` uses a quarter of the points that `nma.evaluate_adapter` uses. The
-            # log loss is then .00003 larger for all variants.
+            # With 16 directions, `common.figures` uses a quarter of the points that `nma.evaluate_adapter` uses, which
+            # makes the log loss of all variants .00003 larger.
             found = common.figures(adapter, self.validation, directions=16)
             return {name: round(value, 7) for name, value in mean_metrics(found).items()}
 
@@ -140,9 +140,9 @@ class Store:
     def cached(
         self, job: Job, kind: str, settings: dict[str, Any], adapter: nma.Adapter, make: Callable[[], Any]
     ) -> Any:
-        """Returns the result of `make` for the given settings and training, and stores it in the file STEM.KIND.json.
+        """Returns the result of `make`, which is stored in the file STEM.KIND.json.
 
-        `make` is called only if the file does not contain this result.
+        `make` is called only if the file has no result for these settings and this training.
         """
         path = self.folder / f"{job.stem}.{kind}.json"
         key = json.loads(json.dumps({**settings, "training": adapter.training}))
