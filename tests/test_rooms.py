@@ -138,3 +138,25 @@ def test_boxes_keep_their_distance(ladder):
 
 def test_the_layout_is_the_same_each_time(ladder):
     assert layout(*ladder, box=10.0, passage=2.0) == layout(*ladder, box=10.0, passage=2.0)
+
+
+# lint-imports does not see imports by name. These files import modules of this package by name:
+BY_NAME = {"nma/__init__.py", "nma/cli/__init__.py", "nma/render/register.py", "nma/sources/__init__.py"}
+# These files import other packages by name:
+OTHERS_BY_NAME = {"nma/doctor.py", "nma/images/metrics.py", "nma/sources/lookup.py"}
+
+
+def test_only_known_files_import_by_name():
+    found = {
+        str(path.relative_to(rooms.ROOT))
+        for path in (rooms.ROOT / rooms.PACKAGE).rglob("*.py")
+        if re.search(r"\b(import_module|__import__)\(", path.read_text())
+    }
+    assert found == BY_NAME | OTHERS_BY_NAME
+
+
+@pytest.mark.parametrize("path", sorted(BY_NAME - {"nma/__init__.py"}))
+def test_modules_are_imported_by_name_within_their_room(path):
+    """`nma/__init__.py` may import any room, because it lies on no floor."""
+    named = re.findall(r'"(nma\.\w+)', (rooms.ROOT / path).read_text())
+    assert set(named) == {".".join(path.split("/")[:2])}
