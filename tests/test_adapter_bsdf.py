@@ -1,6 +1,4 @@
-"""The Mitsuba BSDF `nma`: it has the adapter's values, its methods agree with each other, and it checks inputs and
-edits.
-"""
+"""The Mitsuba BSDF `nma`: its values are the adapter's, its methods are consistent, and it checks inputs and edits."""
 
 import json
 import math

@@ -99,7 +99,7 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
 def test_at_the_horizon_and_below_all_is_zero(tmp_path, name, bounded):
     """In C++, values and densities are 0 at and below the horizon.
 
-    tests/test_brdf.py tests the same in Python.
+    tests/test_brdf.py tests the same rule in Python.
     """
     kind, rng = "azimuth" if name == "anisotropic" else "direction", np.random.default_rng(3)
     size, inputs = output_size(2, TARGETS[name]), encoding.size(kind, MEASURED, True)
