@@ -17,7 +17,8 @@ sigma_t = 0.25
 """
 
 
-# Pixels, and whether they are coloured. Rounding may make the channels of a grey pixel differ a little.
+# Each entry is a pixel and whether this pixel counts as coloured. Rounding may make the channels of a grey pixel differ
+# a little.
 GREYS = (
     ((0.5, 0.5 + 0.8e-6, 0.5), False),
     ((0.5, 0.5 + 1.3e-6, 0.5), True),

@@ -91,7 +91,7 @@ def assert_table(tables, expected):
     assert np.abs(z).max() < limit
     total = float(np.sum(z * z))
     assert chi2.cdf(total, z.size) > FALSE_ALARM / 2, "the stated errors are too large"
-    assert chi2.sf(total, z.size) > FALSE_ALARM / 2, "biased, or the stated errors are too small"
+    assert chi2.sf(total, z.size) > FALSE_ALARM / 2, "the table is biased, or its stated errors are too small"
 
 
 def scatter_tables(source, grid, walks=1 << 21, rho=(0.8, 0.4, 0.0)):
