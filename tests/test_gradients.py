@@ -31,8 +31,8 @@ MATERIAL = {
     "albedo": rgb(0.8, 0.4, 0.3),
     "sigma_t": 0.7,
 }
-# Materials, each with a dictionary from parameters to directions. The tests differentiate pictures along these
-# directions.
+# Each case is a material and a dictionary of directional derivatives to test. A derivative is given by the name of a
+# parameter and the direction in which the parameter changes.
 CASES = {
     "plain": (
         MATERIAL,

@@ -157,6 +157,6 @@ def test_only_known_files_import_by_name():
 
 @pytest.mark.parametrize("path", sorted(BY_NAME - {"nma/__init__.py"}))
 def test_modules_are_imported_by_name_within_their_room(path):
-    """`nma/__init__.py` may import any room, because it lies on no floor."""
+    """`nma/__init__.py` lies on no floor of the drawing, so it may import any room."""
     named = re.findall(r'"(nma\.\w+)', (rooms.ROOT / path).read_text())
     assert set(named) == {".".join(path.split("/")[:2])}

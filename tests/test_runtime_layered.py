@@ -134,8 +134,8 @@ def test_samples_are_those_of_the_package(bridge):
             expected = np.stack([x.numpy() for x in drawn], axis=-1)
             found = bridge("layered_sample", (vector(values), wi, u), (len(u), 7))
             valid = expected[:, 2] > 0
-            # Near the border between two lobes, rounding may choose the other lobe. Near the horizon, it may change
-            # whether a sample is valid.
+            # Near the border between two lobes, rounding may choose the other lobe. Near the horizon, rounding may
+            # change whether a sample is valid.
             assert (valid == (found[:, 3] > 0)).mean() > 0.998
             assert (np.abs(found[:, :3] - expected).max(axis=1) < 1e-3)[valid].mean() > 0.998
 
