@@ -1,5 +1,5 @@
-// Estimates the light of a small lamp that the simulated material reflects towards the viewer. The four estimates have
-// the same mean. The last two estimates use the density `pdf` of the material.
+// Estimates, by four methods, the light of a small lamp that the simulated material reflects towards the viewer. The
+// four estimates have the same mean. The last two methods use the density `pdf` of the material.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered

@@ -52,7 +52,7 @@ struct Options {
 
 class Adapter {
 public:
-    // `prepare_many` splits the queries into blocks of this count.
+    // `prepare_many` splits the queries into blocks of at most BLOCK queries.
     static constexpr int BLOCK = 24;
 
     static Adapter load(const std::string& path, const Options& options = {}) {
@@ -101,7 +101,7 @@ public:
     // Functions that take a cosine c instead of `wi` use the azimuth 0, which is wi = (sqrt(1 - c^2), 0, c).
     bool anisotropic() const { return preparation_.encoding.anisotropic(); }
 
-    // The BRDF of a source material with these parameters for the view direction `wi`, which has z in (0, 1].
+    // The BRDF of the source material with the parameters `parameters`, for the view direction `wi`. wi.z is in (0, 1].
     Brdf prepare(const float* parameters, const Direction& wi) const {
         Brdf made;
         made.in_plane_ = in_plane_;
@@ -145,8 +145,8 @@ public:
         network_outputs(parameters, at_azimuth_0(cos_theta_i), raw);
     }
 
-    // The outputs of the network for many queries. `raw` gets a row of `output_count` numbers for each query, without
-    // alignment.
+    // The outputs of the network for many queries. `raw` gets a row of `output_count` numbers for each query, and need
+    // not be aligned.
     void network_outputs_many(int count, const float* parameters, const Direction* wi, float* raw) const {
         alignas(64) float outputs[BLOCK * WIDEST_LAYER];
         for (int first = 0; first < count; first += BLOCK) {
@@ -259,8 +259,8 @@ private:
         preparation_.outputs_of_lanes = outputs_of_lanes_.data();
     }
 
-    // A direction with this cosine and the azimuth 0. For isotropic adapters, which read only z, x is 0, which saves a
-    // square root.
+    // A direction with the cosine `cos_theta_i` and the azimuth 0. Isotropic adapters read only z, so x is set to 0 for
+    // them, which saves a square root.
     Direction at_azimuth_0(float cos_theta_i) const {
         return {anisotropic() ? safe_sqrt(1.0f - cos_theta_i * cos_theta_i) : 0.0f, 0.0f, cos_theta_i};
     }
@@ -312,7 +312,8 @@ public:
     Curves(const Adapter& adapter, const float* parameters, int nodes = NODES) {
         if (adapter.anisotropic())
             throw Error(
-                "an anisotropic adapter has no curves, because the azimuth of the view matters; prepare by direction");
+                "an anisotropic adapter has no curves, because the azimuth of the view matters; pass directions to "
+                "`prepare`");
         for (int n = 0; n < std::max(nodes, 2); ++n) {
             const float cosine = static_cast<float>(n) / static_cast<float>(std::max(nodes, 2) - 1);
             nodes_.push_back(adapter.prepare(parameters, maximum(cosine, MIN_COS)));

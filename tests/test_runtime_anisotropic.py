@@ -176,10 +176,10 @@ def curves(compiler, tmp_path_factory):
 def test_anisotropic_adapters_have_no_curves(case, curves):
     """A request for curves of an anisotropic adapter throws an error in C++, and returns a null pointer in C.
 
-    The error says that the adapter is anisotropic and must be prepared by direction.
+    The error says that the adapter is anisotropic, and that `prepare` needs directions.
     """
     done = subprocess.run([curves, case[1]], capture_output=True, text=True, check=True)
-    assert "anisotropic" in done.stdout and "prepare by direction" in done.stdout
+    assert "anisotropic" in done.stdout and "pass directions to `prepare`" in done.stdout
     runtime = Runtime(case[1])
     runtime._c.nma_curves_new.restype = ctypes.c_void_p
     assert runtime._c.nma_curves_new(runtime._handle, None) is None

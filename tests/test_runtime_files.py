@@ -169,7 +169,7 @@ def test_a_folder_is_no_weights_file(tmp_path):
         (ranged("target", 3, high=13.0), "target parameter 'specular' has no valid range"),
         (ranged("target", 3, high=math.nan), "JSON"),
         (ranged("target", 2, scale="cubic"), "unknown scale 'cubic'"),
-        (ranged("target", 2, in_plane=True), "'metallic' has no plane of incidence"),
+        (ranged("target", 2, in_plane=True), "'metallic' has the flag in_plane"),
     ],
 )
 def test_files_with_implausible_numbers_are_refused(tmp_path, data, message):

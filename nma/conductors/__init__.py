@@ -15,7 +15,7 @@ class Conductors:
     """Complex indices of refraction eta + i k of real conductors, in linear sRGB.
 
     `names` has n entries. `eta` (.038 .. 7.51) and `k` (.114 .. 9.22) are (n, 3) float64, unitless. `held_out` is (n,)
-    bool, true for the metals that are excluded from training. The arrays are read-only.
+    bool, true for the metals that are excluded from training. All three arrays are read-only.
     """
 
     names: tuple[str, ...]

@@ -15,7 +15,7 @@ _HEAD = """\
 
 namespace nma {
 """
-# In C++, this value stands for an infinite bound of a range.
+# The C++ header has _UNBOUNDED in place of the infinite bound of a range.
 _UNBOUNDED = 1e30
 
 

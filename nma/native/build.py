@@ -72,7 +72,7 @@ def build_mitsuba(say: Callable[[str], None] = lambda line: None) -> Path:
     Raises:
         MissingDependencyError: there is no compiler, or the package nanobind is missing, whose headers Dr.Jit's headers
             include.
-        BuildError: the compiler failed, or this is Windows.
+        BuildError: the compiler failed, or the operating system is Windows.
     """
     folder = mitsuba_folder()
     if folder.exists():

@@ -27,7 +27,7 @@ from nma.native import build
 from nma.params import Bounds
 
 Array = NDArray[np.float32]
-# The index of a name in this tuple is the value of the instruction set's constant in nma_c.h.
+# The order is that of the enum of instruction sets in nma_c.h, so an index in this tuple is a value of the enum.
 INSTRUCTION_SETS = ("fastest", "portable", "neon", "avx2", "avx512", "avx512_bf16")
 _COMPACT = 0x100
 # The alignment of a BRDF in memory [bytes].

@@ -79,7 +79,7 @@ public:
         return std::any_of(inputs_.begin(), inputs_.end(), [](const Input& input) { return input.varies(); });
     }
 
-    // The flags of a one-sided glossy BSDF with these inputs.
+    // The flags of the BSDF, which is glossy and reflects on the front side only.
     auto flags() const {
         const auto one_sided = BSDFFlags::GlossyReflection | BSDFFlags::FrontSide;
         return textured() ? one_sided | BSDFFlags::SpatiallyVarying : one_sided;

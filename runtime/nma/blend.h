@@ -105,7 +105,7 @@ inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded)
     if (bounded) blend.scale = {inverse[0], inverse[1], inverse[2]};
 }
 
-// Copies each number of a geometry to all lanes.
+// Copies each number of a `Geometry` to all lanes.
 template <class T>
 inline Geometry<Lanes<T>> spread(const Geometry<T>& g) {
     const auto all = [](const Vec3<T>& v) { return Vec3<Lanes<T>>{v.x, v.y, v.z}; };

@@ -69,7 +69,7 @@ inline float max_component(const Vec& c) { return maximum(c.x, maximum(c.y, c.z)
 // `w`, moved slightly above the horizon, because visible normals are undefined at the horizon.
 inline Vec above(const Vec& w) { return {w.x, w.y, maximum(w.z, 1e-7f)}; }
 // The inverse of the density of an event. The wider the lobe of the event, the larger is this inverse. `unscattered`
-// computes weights from the inverse.
+// computes the weights of multiple importance sampling from the inverse.
 inline float bluntness(float density) { return 1.0f / maximum(density, 1e-20f); }
 
 // The reflectance of the conductor, per colour channel.

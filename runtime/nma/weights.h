@@ -224,7 +224,7 @@ inline TargetParam target_param(const Json& entry) {
     if (!p.logarithmic && scale != "linear")
         throw Error("target parameter '" + p.name + "' has the unknown scale '" + scale + "'");
     if (p.in_plane && p.name != "anisotropic")
-        throw Error("target parameter '" + p.name + "' has no plane of incidence");
+        throw Error("target parameter '" + p.name + "' has the flag in_plane, which only 'anisotropic' may have");
     return p;
 }
 

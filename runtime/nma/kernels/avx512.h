@@ -99,8 +99,8 @@ NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
         y[v] = total(sums);
     }
 }
-// Computes a layer after the first. `y` holds the neurons of the layer before it on entry, and the neurons of this
-// layer on return.
+// Computes a layer after the first. On entry, `y` holds the neurons of the previous layer. On return, `y` holds the
+// neurons of this layer.
 NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
     const Vec a = max(y[0], set(0.0f)), b = max(y[1], set(0.0f));
     const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a),
@@ -118,7 +118,7 @@ NMA_OP void run_narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]
     for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
 }
 
-// `forward` for any network. The activations of a narrow network stay in registers.
+// The function `forward` of `Kernels`. For a narrow network, the activations stay in registers.
 NMA_FN inline void forward_either(const NetworkView& view, const float* inputs, float* outputs) {
     if (!view.narrow) return forward(view, inputs, outputs);
     Vec y[2];
@@ -141,7 +141,7 @@ NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, cons
     nma::set_lobe_probabilities(blend, wi.z, preparation.bounded);
 }
 
-// `prepare` for any network. The activations of a narrow network stay in registers.
+// The function `prepare` of `Kernels`. For a narrow network, the activations stay in registers.
 NMA_FN inline void prepare_either(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
                                   Blend<float>& blend) {
     if (preparation.network.narrow) return prepare_narrow(preparation, parameters, wi, blend);

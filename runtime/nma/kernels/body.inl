@@ -17,7 +17,7 @@
 //     Few           picks numbers for lanes, from registers if possible: see `Indexed` in preparation.h
 //
 // The members of `Kernels` point to the functions `forward`, `forward_many`, `encode`, `decode`,
-// `set_lobe_probabilities` and `prepare` below. The other functions in this file are helpers of these six.
+// `set_lobe_probabilities` and `prepare` below. The other functions in this file are helpers of these six functions.
 
 // Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first of these neurons. Each
 // neuron has SUMS partial sums, because each addition to a single sum would wait for the addition before it. PAIRS says
