@@ -68,12 +68,12 @@ int main() {
 
         // The weight of a walk that leaves in the direction w towards the lamp. The weight of the evaluation for w is 1
         // minus this weight.
-        const auto odds = [&](const Vec& w) {
+        const auto weight_of_walk = [&](const Vec& w) {
             return layered::pdf(gold, density, VIEW, w) / (layered::pdf(gold, density, VIEW, w) + LAMP_PDF);
         };
         walks.add(met);
         lamp.add(seen);
-        both.add(met * odds(walk.direction) + seen * (1.0f - odds(wo)));
+        both.add(met * weight_of_walk(walk.direction) + seen * (1.0f - weight_of_walk(wo)));
 
         const float u_lobe = random.uniform(), u1 = random.uniform(), u2 = random.uniform();
         const layered::Drawn drawn = layered::sample(gold, density, VIEW, u_lobe, u1, u2);
