@@ -1,4 +1,4 @@
-"""How far adapters are from being reciprocal: the difference between f(wi, wo) and f(wo, wi).
+"""Measures how far adapters are from being reciprocal: the difference between f(wi, wo) and f(wo, wi).
 
 python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
 

@@ -87,7 +87,7 @@ def levels(spp: int) -> list[int]:
 
 
 def table(curves: dict[str, Curve]) -> str:
-    """Returns a table by samples per pixel: the simulation's results, and the adapters' results relative to these."""
+    """Returns a table by samples per pixel: results of the simulation, and results of the adapters as ratios."""
     truth = curves[scenes.SIMULATION]
     headings, rows = ["spp", "seconds", "variance", "error"], []
     for name in curves:

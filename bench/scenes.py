@@ -150,7 +150,7 @@ def preview(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict
 
 
 def lights(bsdf: Bsdf, size: tuple[int, int], rr_depth: int = RR_DEPTH) -> dict[str, Any]:
-    """The shader ball in the dark among small, bright lights. Light sampling and highlights dominate the noise."""
+    """The shader ball in the dark among small, bright lights. Light sampling and highlights cause most of the noise."""
     scene = preview(bsdf, size, rr_depth)
     del scene["sky"], scene["lamp"]
     return scene | {f"light-{n}": _light(*light) for n, light in enumerate(LIGHTS)}

@@ -175,7 +175,7 @@ def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[st
 def unseen(
     members: Sequence[Member], tables: Tables, recipe: Recipe, arguments: argparse.Namespace, kept: Path
 ) -> list[dict[str, Any]]:
-    """Trains a second library that lacks --held-out materials, and then learns latent codes for these materials."""
+    """Trains a second library without N materials (--held-out), and then learns latent codes for these N materials."""
     if not arguments.held_out:
         return []
     out = np.linspace(0, len(members), arguments.held_out, endpoint=False).astype(int) + 1

@@ -4,9 +4,9 @@
 
 A fit is trained on the table that it is evaluated on, so its remaining error comes from the target. A class adapter
 with the same target has a larger error, and the additional error comes from the network, the data and the optimiser.
-The materials are the first --materials of the set "range", which is in random order. Each fit is trained on the
-material's reference table and evaluated on the same table. The metrics of finished materials are kept in
-out/figures/limits.
+The experiment takes the first materials of the set "range", which is in random order; --materials is their number. Each
+fit is trained on the material's reference table and evaluated on the same table. The metrics of finished materials are
+kept in out/figures/limits.
 
 Writes limits.json and limits.png beside this file. With --quick, makes short fits to two materials and writes to
 out/figures/limits.

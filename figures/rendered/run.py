@@ -227,7 +227,7 @@ def markdown(means: dict[str, dict[int, dict[str, float]]], arguments: argparse.
     """Returns tables in Markdown: all metrics at the largest number of samples, then FLIP by samples per pixel."""
     most = arguments.spp
     lines = [
-        f"The first table shows means over {arguments.materials} materials, with {arguments.resolution} x "
+        f"The first table shows means over pictures of {arguments.materials} materials, with {arguments.resolution} x "
         f"{arguments.resolution} pixels. The reference has {arguments.reference_spp} samples per pixel.",
         "",
         "| | samples | " + " | ".join(METRICS) + " |",

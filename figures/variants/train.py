@@ -57,7 +57,7 @@ class Job:
 def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list[Job]:
     """Returns all jobs in the order of training.
 
-    All variants are trained with one seed before the next seed, so that early results cover all variants. The
+    All variants are trained with one seed before the next seed is used, so that early results cover all variants. The
     trainings on the validation set, and the variants `instances`, are run with the first seed only.
     """
     jobs, sizes = [], sorted(set(sizes))
