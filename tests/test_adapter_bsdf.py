@@ -190,8 +190,8 @@ def test_the_methods_of_the_bsdf_agree(weights, stretched_weights, make, stretch
 def test_samples_follow_the_pdf(material):
     """Samples of each shipped adapter follow `pdf` (chi-square test).
 
-    The false-alarm rate is .01 per adapter and material, over three directions together (Sidak). A failure means biased
-    renderings.
+    The false-alarm rate is .01 per adapter and material, over three directions together (Sidak's correction). A failure
+    means biased renderings.
     """
     for adapter in shipped():
         bsdf = {

@@ -95,7 +95,7 @@ def test_at_the_horizon_and_below_all_is_zero_without_a_warning(kind, precision)
 def test_samples_follow_the_density_in_the_local_frame(kind, azimuth):
     """Samples follow the density of `pdf`, for every kind of adapter and every azimuth of the view (chi-square test).
 
-    The false-alarm rate is .01 over all cases together (Sidak). A failure means biased renderings.
+    The false-alarm rate is .01 over all cases together (Sidak's correction). A failure means biased renderings.
     """
 
     def view(like):

@@ -1,7 +1,7 @@
 """The declaration of a class: the distributions of its parameters, its bounds, and the values that it refuses.
 
-The Kolmogorov-Smirnov tests of all columns of a population have the false-alarm rate `FALSE_ALARM` together (Sidak).
-Seeds are fixed.
+The Kolmogorov-Smirnov tests of all columns of a population have the false-alarm rate `FALSE_ALARM` together (Sidak's
+correction). Seeds are fixed.
 """
 
 import numpy as np
