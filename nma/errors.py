@@ -51,7 +51,7 @@ class MissingDependencyError(NmaError, ImportError):
 
 
 def either(words: Iterable[str]) -> str:
-    """Joins options to a text such as "a, b or c"."""
+    """Joins options into a text such as "a, b or c"."""
     *others, last = words
     return f"{', '.join(others)} or {last}" if others else last
 
@@ -64,7 +64,7 @@ def closest(given: str, known: Sequence[str]) -> str | None:
 
 
 def some(names: Sequence[str]) -> str:
-    """Joins the first five names to a text, because there may be hundreds of names."""
+    """Joins the names into a text, but only the first five, because there may be hundreds."""
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
@@ -77,7 +77,7 @@ def hint(given: str, known: Sequence[str]) -> str:
 def one_line(message: str) -> str:
     """Shortens an error message of Mitsuba to one line with the place and the fault.
 
-    Leaves out locations in Mitsuba's source code, and all of a traceback but the error itself.
+    Leaves out locations in Mitsuba's source code, and the whole traceback except the error itself.
     """
     message = re.sub(r"^\[[\w.]+:\d+\] ", "", message.strip())
     message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)

@@ -24,8 +24,8 @@ _ADVICE = {
 
 @contextmanager
 def whole(path: str | Path) -> Iterator[Path]:
-    """Gives the `with` block a temporary file, which replaces `path` when the block ends and is deleted if the block
-    fails.
+    """A context manager: the `with` block gets the path of a temporary file, which replaces `path` when the block ends
+    and is deleted if the block fails.
 
         with whole("gold.npz") as file:
             np.savez(file, ...)
@@ -52,8 +52,8 @@ def whole(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Gives the `with` block a temporary folder, which becomes `path` when the block ends and is deleted if the block
-    fails.
+    """A context manager: the `with` block gets the path of a temporary folder, which becomes `path` when the block ends
+    and is deleted if the block fails.
 
     If another process has made the folder `path` in the meantime, that folder stays and the temporary folder is
     deleted.
@@ -99,7 +99,8 @@ def arrays(path: str | Path) -> Iterator[Any]:
 
 
 def try_file(*paths: str | Path) -> None:
-    """Tests whether files can be written, so that hours of work are not lost at the end. No file is left behind.
+    """Tests whether files can be written, so that hours of work are not lost at the end. The test leaves no file
+    behind.
 
     Raises `OutputError` if a folder or a device has the name of a file, if a file has the name of a folder, if a name
     is too long, or if the disk is full or read-only.
@@ -123,13 +124,14 @@ def try_folder(path: str | Path) -> None:
 
 
 def _try_folder(folder: Path, *names: str) -> None:
-    """Writes a test file to the folder, or to its nearest existing parent, because no new folder may be left behind."""
+    """Writes a test file to the folder, or, if the folder does not exist, to its nearest existing parent, because the
+    test must not create folders."""
     missing = list(names)
     while not os.path.lexists(folder):
         missing.append(folder.name)
         folder = folder.parent
     for name in missing:
-        # A name that is too long fails in every folder, so `lstat` can test the name in this folder.
+        # A name that is too long is invalid in every folder, so `lstat` can test the name in this folder.
         with suppress(FileNotFoundError):
             os.lstat(folder / name)
     trial = _partial(folder / "trial")
@@ -150,7 +152,7 @@ def _check_place(path: Path) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "a folder has this name")
     if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "this is no ordinary file")
+        raise OSError(errno.EINVAL, "this is not a regular file")
 
 
 def _partial(path: Path) -> Path:

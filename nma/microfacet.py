@@ -43,12 +43,12 @@ def visible_normal_pdf(wi: Vec3, m: Vec3, alpha_x: Float, alpha_y: Float) -> Flo
 def sample_visible_normal(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) -> Vec3:
     """Draws a normal with the density `visible_normal_pdf`, for wi.z > 0. Dupuy and Benyoub 2023, listing 1."""
     wi_std = ops.normalize(Vec3(alpha_x * wi.x, alpha_y * wi.y, wi.z))
-    # Draw a uniform point on the spherical cap of directions that reflect wi_std into the upper hemisphere.
+    # Draw a uniform point on the spherical cap z >= -wi_std.z, which contains the reflections of wi_std about all
+    # visible normals of the unit hemisphere.
     phi = (2.0 * ops.PI) * u1
     z = 1.0 - u2 * (1.0 + wi_std.z)
     sin_theta = ops.safe_sqrt(1.0 - z * z)
-    # The half vector of this point and wi_std is a visible normal of the unit hemisphere. Scale this normal back to the
-    # widths alpha.
+    # The half vector of this point and wi_std is the visible normal. Scale this normal back to the widths alpha.
     m_std = Vec3(sin_theta * ops.cos(phi), sin_theta * ops.sin(phi), z) + wi_std
     return ops.normalize(Vec3(alpha_x * m_std.x, alpha_y * m_std.y, ops.maximum(m_std.z, 1e-9)))
 

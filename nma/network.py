@@ -14,7 +14,7 @@ from nma import ops
 from nma.errors import NmaError
 from nma.ops import Float
 
-# A hidden layer that starts near the identity is the identity plus this factor times the random matrix of He 2015.
+# `init` sets a hidden layer near the identity to the identity plus this factor times the random matrix of He 2015.
 _MIXING = 0.25
 
 # The largest depth and width of a network. A renderer could not run larger networks at every shading point.
@@ -26,17 +26,17 @@ _Activation = Callable[[Float], Float]
 # `forward_lanes` splits a dot product into this many sums. A query of a 5x64 network took .56 us on a Zen 4 core with 4
 # sums, and .70 us with one sum.
 _SUMS = 4
-# With AVX-512, `forward_lanes` computes the neurons in blocks of this many, whose sums fit in the 32 registers. A query
-# of a 5x64 network took .34 us on an Intel Xeon (family 6, model 167) with blocks, and .47 us without. With the 16
-# registers of AVX2, blocks bring no gain.
+# With AVX-512, `forward_lanes` computes the neurons in blocks of this size, because the sums of a block fit in the 32
+# registers. A query of a 5x64 network took .34 us on an Intel Xeon (family 6, model 167) with blocks, and .47 us
+# without. With the 16 registers of AVX2, blocks bring no gain.
 _BLOCK = 28
 
 
 def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | None = None) -> Layers:
     """Random layers of the given `sizes` (inputs, hidden layers, outputs), initialised as in He 2015.
 
-    A layer with as many inputs as outputs starts near the identity, which makes a deep network as easy to train as a
-    shallow network. The last layer has small weights and the bias `output_bias` (outputs,), or the bias 0 if
+    A layer with as many inputs as outputs is initialised near the identity, which makes a deep network as easy to train
+    as a shallow network. The last layer has small weights and the bias `output_bias` (outputs,), or the bias 0 if
     `output_bias` is None.
     """
     layers: Layers = []
@@ -64,9 +64,9 @@ def forward_lanes(
     """The outputs of the network in Dr.Jit. `x` has one array per input, and the result has one array per output.
 
     The network is unrolled into the kernel, with its weights as literals. In the virtual functions of a renderer,
-    weights in memory, as in `drjit.nn`, would take ten times as long on LLVM, because they are gathered lane by lane. A
-    packet without any `active` lane skips the network and returns zeros. The skip saves time, because in a scene with
-    only one BSDF, a renderer calls this BSDF even for rays that hit nothing.
+    reading the weights from memory, as `drjit.nn` does, would take ten times as long on LLVM, because the weights would
+    be gathered lane by lane. A packet without any `active` lane skips the network and returns zeros. The skip saves
+    time, because in a scene with only one BSDF, a renderer calls this BSDF even for rays that hit nothing.
     """
     import drjit as dr
 

@@ -27,8 +27,8 @@ Range = Literal["training", "valid"]
 ROUNDING = 1e-6
 # The advice at the end of the error message for a parameter that is out of range.
 _ADVICE = {
-    "training": ", the range that the adapter was trained on; set `clamp` to move it there",
-    "valid": "; take a value in between",
+    "training": ", the range that the adapter was trained on; set `clamp` to clamp such values",
+    "valid": "; choose a value within this range",
 }
 
 
@@ -36,7 +36,7 @@ class Bounds(NamedTuple):
     """The range from `low` to `high`. Every check of a parameter calls `bad`, and reports the message that `refusal`
     returns.
 
-    Methods take NumPy or Dr.Jit arrays. `low` and `high` may also be arrays, with one number per column.
+    Methods take NumPy or Dr.Jit arrays. `low` and `high` may also be arrays, with one bound per column.
     """
 
     low: Any
@@ -159,7 +159,7 @@ class ParamSpace:
         value.
 
         Values that exceed a bound by a rounding error are replaced by the bound. With `clamp`, all values out of range
-        are replaced by the nearest bound. Values that are not finite always raise the error.
+        are replaced by the nearest bound. Values that are not finite raise the error even with `clamp`.
         """
         p = np.atleast_2d(np.asarray(params, np.float64))
         if p.ndim != 2 or p.shape[1] != self.size:
@@ -186,9 +186,9 @@ class ParamSpace:
         """Random parameter vectors (n, size), drawn from the law of each parameter.
 
         For classes with a conductor, `population` chooses how (eta, k) is drawn. "range" draws every channel uniformly.
-        "metals" takes real metals, except those held out for tests. "held_out_metals" takes only the metals held out.
-        "mixed", for training, takes "range" or "metals" with equal probability. "unseen_metals", for tests, takes every
-        third material from the metals held out and the others from the other metals.
+        "metals" draws from the real metals, except those held out for tests. "held_out_metals" draws only from the
+        metals held out. "mixed", for training, uses "range" or "metals" with equal probability. "unseen_metals", for
+        tests, draws every third material from the metals held out and the other materials from the other metals.
         """
         if population not in get_args(Population):
             raise ParamError(
@@ -270,7 +270,7 @@ LAYERED3 = ParamSpace(
 MEASURED = ParamSpace("measured", ())
 
 # The class of the materials of a library (`nma.adapter.library`). The only parameter of this class is the learned code
-# of a material. The single numbers of a code have no meaning.
+# of a material. The individual numbers of a code have no meaning.
 CODE_BOUND = 4.0
 LIBRARY = ParamSpace(
     "library",

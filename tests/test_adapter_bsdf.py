@@ -343,7 +343,7 @@ def test_clamp_moves_inputs_to_the_training_range(weights):
             {"alpha_top": 0.9},
             "alpha_top is 0.9, allowed is 0.001 .. 0.316228, the range that the adapter was trained on",
         ),
-        ({"alpha_top": 0.9}, "set `clamp` to move it there"),
+        ({"alpha_top": 0.9}, "set `clamp` to clamp such values"),
         ({"eta_conductor": rgb([0.1, 9.0, 1.0])}, "eta_conductor is 0.1, 9, 1, allowed is 0.03 .. 7.6"),
         ({"alpha_top": float("nan"), "clamp": True}, "alpha_top is nan"),
         ({"alpha_bottom": texture(np.nan)}, "texture of alpha_bottom at x=5, y=2: alpha_bottom is nan"),

@@ -79,7 +79,9 @@ def test_pictures_too_large_for_memory_are_refused_before_rendering(nma, tmp_pat
         code, out, err = nma("render", subject, "--size", 65536, "-o", tmp_path / "a.png")
         assert (code, out) == (2, "") and "too large" in err
     path.write_text(SCENE.format(integrator=PATH, pixels="rgb", size=20000))
-    with pytest.raises(ParamError, match=f"20000 x 20000 pixels is too large; take at most {MOST_PIXELS:,}"):
+    with pytest.raises(
+        ParamError, match=f"20000 x 20000 pixels is too large; choose at most {MOST_PIXELS:,}"
+    ):
         render_passes(load_scene(path), 1)
 
 

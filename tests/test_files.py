@@ -33,7 +33,7 @@ def places(tmp_path) -> dict[str, Path]:
         "a file where a folder is needed": tmp_path / "file" / "sub" / "a.npz",
         "name too long": tmp_path / ("n" * 300 + ".npz"),
         "too long": tmp_path / ("n" * 300) / "a.npz",
-        "no ordinary file": Path(os.devnull),
+        "not a regular file": Path(os.devnull),
     }
 
 

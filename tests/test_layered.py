@@ -22,7 +22,7 @@ def layers_of(values, n):
     The parameters are opaque to the compiler, so that all materials share one kernel.
     """
     columns = [dr.opaque(Float, float(c)) + dr.zeros(Float, n) for c in vector(values)]
-    return layered_eval.settle(Layered3().gather(columns))
+    return layered_eval.match_index(Layered3().gather(columns))
 
 
 def direction(cos_theta):
@@ -144,7 +144,7 @@ def test_finite_everywhere():
 
     bounds = [p.bounds("valid") for p in LAYERED3.params for _ in range(p.size)]
     columns = [spread(low, min(high, 10.0), log=i < 2) for i, (low, high) in enumerate(bounds)]
-    layers = layered_eval.settle(Layered3().gather(columns))
+    layers = layered_eval.match_index(Layered3().gather(columns))
     wi, wo = direction(spread(1e-7, 1.0, log=True)), direction(spread(1e-7, 1.0, log=True))
     phi = spread(0.0, 2.0 * np.pi)
     turned = Vec3(wo.x * dr.cos(phi), wo.x * dr.sin(phi), wo.z)

@@ -76,7 +76,7 @@ def test_the_floor_reflects_less_than_it_receives(lighting):
 
 
 def test_unknown_lightings_and_a_missing_sun_are_refused():
-    with pytest.raises(ParamError, match="unknown lighting 'indoors'; take studio or outdoors"):
+    with pytest.raises(ParamError, match="unknown lighting 'indoors'; choose studio or outdoors"):
         preview_scene(GREY, lighting="indoors")
     with pytest.raises(ParamError, match="no sun to hide"):
         preview_scene(GREY, hide_sun=True)

@@ -145,7 +145,9 @@ def test_textures_of_eight_bits_are_checked_by_the_values_they_evaluate_to(model
 
 @pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="there is an NVIDIA GPU")
 def test_variants_for_a_missing_device_are_refused():
-    with pytest.raises(MissingDependencyError, match="cuda_ad_rgb needs an NVIDIA GPU.*or take llvm_ad_rgb"):
+    with pytest.raises(
+        MissingDependencyError, match="cuda_ad_rgb needs an NVIDIA GPU.*or choose llvm_ad_rgb"
+    ):
         nma.render.use("cuda_ad_rgb")
 
 

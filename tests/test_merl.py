@@ -315,7 +315,7 @@ def test_any_isotropic_material_is_written_by_a_command(
         (["brushed.xml"], "this source is anisotropic"),
         (["table.npz"], "holds tables.*nma fit table.npz"),
         (["none.npz"], "no such file"),
-        (["class.safetensors"], "class: an adapter of the whole class layered3; name a material"),
+        (["class.safetensors"], "class is an adapter of the whole class layered3; name a material"),
         (["gold-red-laquer"], "did you mean 'gold-red-lacquer'"),
         (["wet-nickel", "--adapter", "single.safetensors"], "was trained for a single material"),
     ],

@@ -97,7 +97,7 @@ def test_a_mesh_that_cannot_be_shown_is_refused(tmp_path, text, message):
 def test_an_unknown_file_format_or_axis_is_refused(wedge, tmp_path):
     with pytest.raises(MeshError, match=r"must end in \.ply or \.obj"):
         mesh_shape(tmp_path / "mesh.stl")
-    with pytest.raises(MeshError, match="take z or y"):
+    with pytest.raises(MeshError, match="choose z or y"):
         mesh_shape(wedge, up="x")
 
 

@@ -234,7 +234,10 @@ def changed(fields, **others):
     [
         ({"rgb": None}, "field 'rgb' is missing"),
         ({"vndf": None}, "field 'vndf' is missing"),
-        ({"rgb": None, "spectra": np.zeros((1, 8, 4, 2, 2), np.float32)}, "holds spectra; take .*_rgb.bsdf"),
+        (
+            {"rgb": None, "spectra": np.zeros((1, 8, 4, 2, 2), np.float32)},
+            "holds spectra; choose .*_rgb.bsdf",
+        ),
         ({"theta_i": np.zeros(7, np.float32)}, r"field 'vndf' has shape \(1, 8,"),
         ({"ndf": np.zeros(128, np.float32)}, "field 'ndf' has shape .*, but must have 2 dimensions"),
         ({"sigma": np.full((2, 128), np.nan, np.float32)}, "field 'sigma' has values that are not finite"),

@@ -147,9 +147,9 @@ def _quarter(w):
 
 
 def test_recipes_and_sources_must_agree_on_isotropy():
-    with pytest.raises(NmaError, match="BSDF 'roughconductor' is anisotropic; take a recipe whose target"):
+    with pytest.raises(NmaError, match="BSDF 'roughconductor' is anisotropic; choose a recipe whose target"):
         fit(from_dict(BRUSHED), QUICK, {})
-    with pytest.raises(NmaError, match="the table is isotropic; take a recipe whose target"):
+    with pytest.raises(NmaError, match="the table is isotropic; choose a recipe whose target"):
         fit(tabulate_values(LAMBERT, grid=SMALL), recipes.ANISOTROPIC)
     with pytest.raises(
         NmaError, match="formula has values without noise, so the recipe's loss must be 'log'"

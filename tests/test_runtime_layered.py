@@ -60,7 +60,7 @@ def bridge(compiler, tmp_path_factory):
 
 
 def layers_of(values):
-    return layered_eval.settle(Layered3().gather([dr.auto.Float(float(x)) for x in vector(values)]))
+    return layered_eval.match_index(Layered3().gather([dr.auto.Float(float(x)) for x in vector(values)]))
 
 
 def vec3(rows):
@@ -115,7 +115,7 @@ def test_density_is_that_of_the_package_case_by_case(bridge):
     wo = np.where(near[:, None], beside, wo)
     assert near.mean() > 0.3
     wi, wo = wi.astype(np.float32), wo.astype(np.float32)
-    layers = layered_eval.settle(
+    layers = layered_eval.match_index(
         Layered3().gather([dr.auto.Float(c) for c in np.ascontiguousarray(params.T)])
     )
     expected = layered_eval.pdf(layers, vec3(wi), vec3(wo)).numpy()

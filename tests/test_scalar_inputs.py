@@ -255,7 +255,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
             {"sigma_t": bitmap([0, 7, 0]), "sigma_t_channel": "g"},
             "at x=1, y=2: sigma_t is 7, allowed",
         ),
-        ({"sigma_t": coloured, "sigma_t_channel": "a"}, "sigma_t_channel is 'a'; take r, g or b"),
+        ({"sigma_t": coloured, "sigma_t_channel": "a"}, "sigma_t_channel is 'a'; choose r, g or b"),
         ({"sigma_t_channel": "g"}, "sigma_t_channel chooses a channel of a texture"),
         ({"albedo_channel": "g"}, "albedo_channel chooses a channel of a texture"),
         ({"albedo": CHECKS | {"color1": 1.5}}, "the texture of albedo: albedo is 1.5, allowed"),
@@ -268,7 +268,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
         ({"sigma_t": bitmap(7.0), "clamp": True}, None),
         (
             {"sigma_t": bitmap(-1.0), "type": "layered"},
-            "the texture of sigma_t at x=1, y=2: sigma_t is -1, allowed is 0 .. 1000; take a value",
+            "the texture of sigma_t at x=1, y=2: sigma_t is -1, allowed is 0 .. 1000; choose a value",
         ),
         ({"sigma_t": bitmap(7.0), "type": "layered"}, None),
         ({"adapter": one, "sigma_t": 0.5}, None),

@@ -101,7 +101,7 @@ def test_files_of_tables_name_the_class(bare, nma):
         ),
         (
             "evaluate layered3-3x32 --reference drawn.npz",
-            "drawn.npz: the tables are of class bare, but layered3-3x32 is for class layered3; take tables of",
+            "drawn.npz: the tables are of class bare, but layered3-3x32 is for class layered3; choose tables of",
         ),
     ):
         code, _, told = nma(*command.split())
@@ -114,14 +114,14 @@ def test_files_of_tables_name_the_class(bare, nma):
     [
         (
             "render steel.toml",
-            "the adapter layered3-5x64 is for class layered3; take an adapter of class bare",
+            "the adapter layered3-5x64 is for class layered3; choose an adapter of class bare",
         ),
         (
             "render steel.toml --model layered",
             "simulates only class layered3; `nma simulate` makes a table of steel",
         ),
-        ("compare steel.toml", "take an adapter of class bare: `nma train` makes one, and `nma fit`"),
-        ("data merl steel.toml -o x.binary", "take an adapter of class bare"),
+        ("compare steel.toml", "choose an adapter of class bare: `nma train` makes one, and `nma fit`"),
+        ("data merl steel.toml -o x.binary", "choose an adapter of class bare"),
     ],
 )
 def test_a_material_of_the_class_is_refused_where_another_class_is_needed(bare, nma, command, advice):
@@ -135,7 +135,7 @@ def test_a_scene_refuses_a_material_of_another_class(bare):
     nma.render.use("llvm_ad_rgb")
     for model in ("nma", "layered"):
         with pytest.raises(
-            SceneError, match="is of class bare, but this BSDF needs class layered3; take a material"
+            SceneError, match="is of class bare, but this BSDF needs class layered3; choose a material"
         ):
             load_dict({"type": model, "material": str(bare)})
 

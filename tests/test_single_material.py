@@ -70,7 +70,9 @@ def test_only_the_recorded_material_is_accepted_up_to_rounding(weights):
 )
 def test_a_record_that_is_no_material_of_the_class_is_refused(tmp_path, params):
     of_gold(params=params).save(tmp_path / "a.safetensors")
-    with pytest.raises(WeightsError, match="a.safetensors: its material does not fit the class layered3"):
+    with pytest.raises(
+        WeightsError, match="a.safetensors: the recorded material does not fit the class layered3"
+    ):
         Adapter.load(tmp_path / "a.safetensors")
 
 

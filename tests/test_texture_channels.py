@@ -50,7 +50,7 @@ def test_the_parameter_is_the_value_of_the_chosen_channel(kind, packed):
             "coloured.*alpha_bottom is one number per pixel; choose a channel: set `alpha_bottom_channel`",
         ),
         ("b", r"at x=0, y=0, the first of 16 such pixels: \w+ is 0, allowed.*bytes.*`format` \"variant\""),
-        ("luminance", "alpha_bottom_channel is 'luminance'; take r, g or b"),
+        ("luminance", "alpha_bottom_channel is 'luminance'; choose r, g or b"),
     ),
 )
 def test_other_choices_are_refused(kind, packed, channel, message):

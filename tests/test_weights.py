@@ -163,10 +163,10 @@ def _nested(depth):
 
 
 HEADERS = {
-    "another format": (lambda h: _with(h, format=2), "format 2, this version reads 1; upgrade"),
+    "another format": (lambda h: _with(h, format=2), "format 2, but this version reads format 1; upgrade"),
     "another class": (
         lambda h: _with(h, class_name="velvet"),
-        "class 'velvet'; this version has layered3",
+        "class 'velvet' is unknown; this version has layered3",
     ),
     "other parameters": (lambda h: _parameters(h, 1, name="gloss"), "differs .* parameter 1, alpha_bottom"),
     "another range": (lambda h: _parameters(h, 6, high=2.0), "differs .* parameter 6, sigma_t"),
@@ -181,13 +181,13 @@ HEADERS = {
         r"maps \d+ inputs to 23 .*says",
     ),
     "other instances": (lambda h: _with(h, instances=3), "23 outputs, but its description says .* to 35"),
-    "no instances": (lambda h: _with(h, instances=0), "blend of 0 instances"),
+    "no instances": (lambda h: _with(h, instances=0), "blend has 0 instances"),
     "other hidden layers": (lambda h: _with(h, hidden=[32, 32, 64]), r"not have the widths \[32, 32, 64\]"),
     "more hidden layers": (lambda h: _with(h, hidden=[32] * 4), "'layer4.weight' is missing"),
-    "hidden no list": (lambda h: _with(h, hidden=None), "'hidden' of the wrong type, None"),
-    "instances no number": (lambda h: _with(h, instances="two"), "'instances' of the wrong type, 'two'"),
-    "a field more": (lambda h: _with(h, colour=1), "metadata of another version.*colour"),
-    "a field less": (lambda h: _with(h, dialect="absent"), "metadata of another version.*dialect"),
+    "hidden no list": (lambda h: _with(h, hidden=None), "'hidden' has the wrong type, None"),
+    "instances no number": (lambda h: _with(h, instances="two"), "'instances' has the wrong type, 'two'"),
+    "a field more": (lambda h: _with(h, colour=1), "metadata comes from another version.*colour"),
+    "a field less": (lambda h: _with(h, dialect="absent"), "metadata comes from another version.*dialect"),
     "other target": (
         lambda h: _with(h, target=[{**h["target"][0], "name": "glow"}, *h["target"][1:]]),
         "glow",
@@ -206,9 +206,9 @@ HEADERS = {
     ),
     "target twice": (lambda h: _with(h, target=[*h["target"][:3], *h["target"][1:]]), "no name twice"),
     "target without a colour": (lambda h: _with(h, target=h["target"][1:]), "must have a base_color"),
-    "nested without end": (lambda h: _with(h, training={"a": _nested(900)}), "nests 902 deep, at most 32"),
+    "nested without end": (lambda h: _with(h, training={"a": _nested(900)}), "nest 902 deep, but at most 32"),
     "target no table": (lambda h: _with(h, target=["roughness"]), "malformed"),
-    "a list": (lambda h: [h], "metadata of another version"),
+    "a list": (lambda h: [h], "metadata comes from another version"),
 }
 
 
@@ -223,17 +223,29 @@ def test_metadata_that_does_not_fit_is_refused(path, change):
 def test_metadata_that_is_no_json_is_refused(path):
     _, tensors = parts(path)
     path.write_bytes(save(tensors, metadata={"nma": "{"}))
-    assert "metadata of another version" in refusal(path)
+    assert "metadata comes from another version" in refusal(path)
 
 
 TENSORS = {
     "missing weight": (lambda t: t.pop("layer2.weight"), "'layer2.weight' is missing"),
     "missing bias": (lambda t: t.pop("layer0.bias"), "'layer0.bias' is missing"),
     "all missing": (lambda t: t.clear(), "'layer0.weight' is missing"),
-    "transposed": (lambda t: t.update({"layer3.weight": t["layer3.weight"].T.copy()}), "layer 3 has shapes"),
-    "short bias": (lambda t: t.update({"layer1.bias": t["layer1.bias"][:-1].copy()}), "layer 1 has shapes"),
-    "flat": (lambda t: t.update({"layer0.weight": t["layer0.weight"].ravel()}), "layer 0 has shapes"),
-    "a number": (lambda t: t.update({"layer0.weight": np.ones((), np.float32)}), "layer 0 has shapes"),
+    "transposed": (
+        lambda t: t.update({"layer3.weight": t["layer3.weight"].T.copy()}),
+        "layer 3 has weights of shape",
+    ),
+    "short bias": (
+        lambda t: t.update({"layer1.bias": t["layer1.bias"][:-1].copy()}),
+        "layer 1 has weights of shape",
+    ),
+    "flat": (
+        lambda t: t.update({"layer0.weight": t["layer0.weight"].ravel()}),
+        "layer 0 has weights of shape",
+    ),
+    "a number": (
+        lambda t: t.update({"layer0.weight": np.ones((), np.float32)}),
+        "layer 0 has weights of shape",
+    ),
     "NaN": (lambda t: t["layer2.weight"].__setitem__((3, 5), np.nan), "layer 2 holds numbers that are not"),
     "infinity": (lambda t: t["layer0.bias"].__setitem__(0, np.inf), "layer 0 holds numbers that are not"),
     "narrow": (
@@ -260,7 +272,7 @@ def test_metadata_nested_without_end_is_refused(path, depth, brackets):
     _, tensors = parts(path)
     for text in (opening * depth, opening * depth + "0" + brackets[1] * depth):
         path.write_bytes(save(tensors, metadata={"nma": text}))
-        assert f"nests {depth} deep" in refusal(path)
+        assert f"nest {depth} deep" in refusal(path)
 
 
 def test_brackets_in_strings_do_not_count_as_nesting(path, tmp_path):

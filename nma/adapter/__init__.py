@@ -1,4 +1,4 @@
-"""Adapters: a network with its encoding and its weights file. The folder `trained` has the shipped adapters."""
+"""Adapters: a network with its encoding and its weights file. The folder `trained` contains the shipped adapters."""
 
 from nma.adapter.adapter import Adapter, shipped, weights_file
 

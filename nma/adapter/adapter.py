@@ -1,4 +1,4 @@
-"""The adapter maps source parameters and the view direction wi to the parameters of the target (paper eq. 4)."""
+"""The adapter maps a material's parameters and the view direction wi to the parameters of the target (paper eq. 4)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
 _SHIPPED = files("nma.adapter").joinpath("trained")
-# Two parameters count as equal if their relative difference is less than SAME, because single precision rounds them.
+# Two parameter values count as equal if their relative difference is less than SAME, because single precision rounds
+# values.
 SAME = 1e-5
 
 
@@ -47,7 +48,8 @@ def shipped() -> tuple[str, ...]:
 
 
 def weights_file(name_or_path: str | Path) -> Path:
-    """The path of the weights file of a shipped adapter. Any other name is returned as a path."""
+    """The path of the weights file of a shipped adapter. A name that is not a shipped adapter's is returned as a
+    path."""
     if str(name_or_path) in shipped():
         return Path(str(_SHIPPED.joinpath(f"{name_or_path}.safetensors")))
     return Path(name_or_path)
@@ -97,7 +99,7 @@ class Adapter:
         return adapter
 
     def save(self, path: str | Path, more: Mapping[str, NDArray] | None = None) -> None:
-        """Writes a weights file, atomically. `more` has further tensors to store beside those of the network."""
+        """Writes a weights file, atomically. `more` contains further tensors to store in the same file."""
         header = weights.Header(
             class_name=self.space.name,
             parameters=weights.describe(self.space),
@@ -152,11 +154,12 @@ class Adapter:
         return np.asarray(fitted, np.float64)
 
     def check_class(self, class_name: str, material: str, name: str) -> None:
-        """Raises `ParamError` if a material has another class than this adapter. The message uses both names."""
+        """Raises `ParamError` if a material has another class than this adapter. The error message contains `material`
+        and `name`, the names of the material and of the adapter."""
         if class_name != self.space.name:
             raise ParamError(
-                f"{material} is of class {class_name}, but the adapter {name} is for class {self.space.name}; take an "
-                f"adapter of class {class_name}: `nma train` makes one, and `nma fit` one for {material} alone"
+                f"{material} is of class {class_name}, but the adapter {name} is for class {self.space.name}; choose "
+                f"an adapter of class {class_name}: `nma train` makes one, and `nma fit` one for {material} alone"
             )
 
     def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
@@ -203,8 +206,8 @@ class Adapter:
         return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
 
     def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF for the view direction `wi` from the numbers that describe the target. `flat` has one array for each
-        number."""
+        """The BRDF for the view direction `wi` from the flat list of numbers that describe the target
+        (`nma.target.numbers`). `flat` has one array for each number."""
         return self._framed(from_numbers(flat, self.target), wi)
 
     def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
@@ -240,15 +243,17 @@ class Adapter:
                 f"{path}: the adapter uses the Principled dialect '{dialect}', but this version has '{DIALECT}'"
             )
         if self.instances < 1:
-            raise WeightsError(f"{path}: its blend of {self.instances} instances is empty; train again")
+            raise WeightsError(
+                f"{path}: the blend has {self.instances} instances, but needs at least 1; train again"
+            )
         if self.anisotropic and (self.in_plane or not self.directional):
             raise WeightsError(
-                f"{path}: it is anisotropic, but its lobes stretch along the plane of incidence, or its network does "
-                "not read the view direction; train again"
+                f"{path}: the adapter is anisotropic, but its lobes stretch along the plane of incidence, or "
+                "its network does not read the view direction; train again"
             )
         if self.in_plane and not self.directional:
             raise WeightsError(
-                f"{path}: its lobes stretch along the plane of incidence, but its network does not read the view "
+                f"{path}: the lobes stretch along the plane of incidence, but the network does not read the view "
                 "direction; train again"
             )
         inputs = encoding.size(self.encoding, self.space, self.directional)
@@ -264,10 +269,10 @@ class Adapter:
         try:
             known = self.material
             if known is not None and self.space.check(known).shape[1:] != known.shape:
-                raise ParamError(f"its parameters have the shape {known.shape}")
+                raise ParamError(f"the parameters have the shape {known.shape}")
         except (ValueError, TypeError) as e:
             raise WeightsError(
-                f"{path}: its material does not fit the class {self.space.name} ({e}); fit it again"
+                f"{path}: the recorded material does not fit the class {self.space.name} ({e}); fit the adapter again"
             ) from None
 
 

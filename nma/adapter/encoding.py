@@ -20,7 +20,7 @@ Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
 # The cosine of 84 degrees, near which the reflectance of metals has a minimum before it rises to 1.
 GRAZING = 0.1045
-# The smallest cosine of the refracted direction that is used, in place of smaller cosines.
+# Cosines of the refracted direction that are smaller than this value are set to this value.
 MIN_COS_T = 0.05
 
 
@@ -78,8 +78,8 @@ ENCODERS: dict[str, Encoder] = {
     "azimuth": azimuth,
     "layered3": layered3,
 }
-# SINGLE has the encodings for a single material, which use only the direction. The encodings in ANISOTROPIC depend on
-# the azimuth of the direction.
+# SINGLE lists the encodings for a single material, which use only the direction. ANISOTROPIC lists the encodings that
+# depend on the azimuth of the direction.
 SINGLE = ("direction", "azimuth")
 ANISOTROPIC = ("azimuth",)
 
@@ -94,5 +94,6 @@ def get(name: str) -> Encoder:
 
 
 def size(name: str, space: ParamSpace, directional: bool) -> int:
-    """How many inputs a network of this class and encoding has, with or without the view direction."""
+    """The number of inputs of a network for this class and encoding, with the view direction if `directional` is
+    true."""
     return len(get(name)([0.5] * space.size, ops.at_azimuth_0(0.5) if directional else None))

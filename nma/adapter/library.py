@@ -66,7 +66,7 @@ class Library:
             library = Library(adapter, tuple(names), codes)
             LIBRARY.check(codes)
         except (WeightsError, ParamError) as e:
-            raise WeightsError(f"{path}: {e}; copy or train it again") from None
+            raise WeightsError(f"{path}: {e}; copy the file again, or train again") from None
         return library
 
     def save(self, path: str | Path) -> None:
@@ -76,7 +76,7 @@ class Library:
 
     @property
     def parameters(self) -> int:
-        """How many values were trained: those of the codes and the network's weights and biases."""
+        """The number of trained values, which are the codes and the network's weights and biases."""
         return self.codes.size + network.parameters(self.adapter.layers)
 
     def code(self, name: str) -> NDArray[np.float32]:
@@ -88,7 +88,7 @@ class Library:
         return self.codes[self.names.index(name)]
 
     def mix(self, names: Sequence[str], weights: ArrayLike) -> NDArray[np.float32]:
-        """The mean (32,) of the codes of some materials, weighted by `weights`, which are at least 0."""
+        """The mean (32,) of the codes of the materials `names`, weighted by `weights`, which must be at least 0."""
         shares = np.asarray(weights, np.float64)
         if shares.shape != (len(names),) or not (np.isfinite(shares).all() and (shares >= 0).all()):
             raise ParamError(
@@ -100,8 +100,8 @@ class Library:
         return (shares / shares.sum() @ codes).astype(np.float32)
 
     def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
-        """The material of a code as an adapter of that one material. The result reads only cos(theta_i): what the code
-        contributes to the first layer is added to the biases."""
+        """An adapter of a single material: the material that the code describes. Its network reads only cos(theta_i),
+        because the contribution of the code to the first layer is added to the biases of that layer."""
         code = LIBRARY.check(code)
         if len(code) != 1:
             raise ParamError(f"`material` takes one code; got {len(code)} codes")

@@ -24,7 +24,7 @@ class AdapterValues:
         if not given.size and adapter.space.size:
             if adapter.material is None:
                 raise ParamError(
-                    f"{name}: an adapter of the whole class {adapter.space.name}; name a material"
+                    f"{name} is an adapter of the whole class {adapter.space.name}; name a material"
                 )
             given = adapter.material
         self.params = adapter.check(given[None])[0].tolist()

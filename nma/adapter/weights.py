@@ -26,7 +26,7 @@ from nma.network import Layers
 from nma.params import ParamSpace
 
 FORMAT = 1
-# The deepest nesting of brackets that is read in the metadata. Files of trained adapters nest 4 deep.
+# The deepest nesting of brackets that is read in the metadata. In the files of trained adapters, brackets nest 4 deep.
 MAX_DEPTH = 32
 
 
@@ -63,7 +63,7 @@ def describe(space: ParamSpace) -> list[dict[str, Any]]:
 def write(
     path: str | Path, header: Header, layers: Layers, more: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Writes a weights file, atomically. `more` has further tensors to store beside those of the layers."""
+    """Writes a weights file, atomically. `more` contains further tensors to store in the same file."""
     tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in (more or {}).items()}
     for number, (matrix, bias) in enumerate(layers):
         tensors[f"layer{number}.weight"] = np.ascontiguousarray(matrix, np.float32)
@@ -83,11 +83,12 @@ def read(path: str | Path) -> tuple[Header, Layers]:
             tensors = {name: f.get_tensor(name) for name, kind in types.items() if kind == "F32"}
     except (SafetensorError, OSError, ValueError, TypeError) as e:
         raise WeightsError(
-            f"{path}: truncated, or not a safetensors file ({e}); copy or train it again"
+            f"{path}: truncated, or not a safetensors file ({e}); copy the file again, or train again"
         ) from None
     if "nma" not in metadata:
         raise WeightsError(
-            f"{path}: a safetensors file without NMA metadata, so it is no adapter; `nma train` writes adapters"
+            f"{path}: a safetensors file without NMA metadata, so the file is not an adapter; "
+            "`nma train` writes adapters"
         )
     _check_types(path, types)
     header = _header(path, metadata["nma"])
@@ -109,18 +110,19 @@ def _header(path: Path, text: str) -> Header:
     """Parses the JSON text of the header and checks the type of each field."""
     if _depth(text) > MAX_DEPTH:
         raise WeightsError(
-            f"{path}: its metadata nests {_depth(text)} deep, at most {MAX_DEPTH} is allowed; train again"
+            f"{path}: the brackets of the metadata nest {_depth(text)} deep, but at most {MAX_DEPTH} is allowed; "
+            "train again"
         )
     try:
         header = Header(**json.loads(text))
     except (TypeError, ValueError) as e:
         raise WeightsError(
-            f"{path}: metadata of another version ({e}); upgrade the package or train again"
+            f"{path}: the metadata comes from another version ({e}); upgrade the package or train again"
         ) from None
     for name, hint in get_type_hints(Header).items():
         if not isinstance(getattr(header, name), get_origin(hint) or hint):
             raise WeightsError(
-                f"{path}: its metadata has a '{name}' of the wrong type, {getattr(header, name)!r}; train again"
+                f"{path}: the metadata field '{name}' has the wrong type, {getattr(header, name)!r}; train again"
             )
     return header
 
@@ -135,15 +137,15 @@ def _depth(text: str) -> int:
 
 
 def _check_class(path: Path, header: Header) -> None:
-    """Raises `WeightsError` if this version does not have the file's format or class, or has another class of that
-    name."""
+    """Raises `WeightsError` if this version does not support the file's format or class, or declares other parameters
+    for the class."""
     if header.format != FORMAT:
         raise WeightsError(
-            f"{path}: format {header.format}, this version reads {FORMAT}; upgrade the package"
+            f"{path}: the file has format {header.format}, but this version reads format {FORMAT}; upgrade the package"
         )
     if header.class_name not in sources.classes():
         raise WeightsError(
-            f"{path}: made for class '{header.class_name}'; this version has {', '.join(sources.classes())}"
+            f"{path}: the class '{header.class_name}' is unknown; this version has {', '.join(sources.classes())}"
         )
     space = sources.space(header.class_name)
     keys = ("name", "size", "law", "low", "high")
@@ -151,12 +153,13 @@ def _check_class(path: Path, header: Header) -> None:
         theirs = header.parameters[number] if number < len(header.parameters) else None
         if not isinstance(theirs, dict) or any(theirs.get(k) != declared[k] for k in keys):
             raise WeightsError(
-                f"{path}: its class '{header.class_name}' differs from this version's in parameter {number}, "
+                f"{path}: the file's class '{header.class_name}' differs from this version's in parameter {number}, "
                 f"{declared['name']}; use the version that wrote the file, or train again"
             )
     if len(header.parameters) > len(space.params):
         raise WeightsError(
-            f"{path}: its class '{header.class_name}' has more parameters than this version's; upgrade the package"
+            f"{path}: the file's class '{header.class_name}' has more parameters than this version's; "
+            "upgrade the package"
         )
 
 
@@ -167,17 +170,20 @@ def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layer
         try:
             matrix, bias = tensors[f"layer{number}.weight"], tensors[f"layer{number}.bias"]
         except KeyError as e:
-            raise WeightsError(f"{path}: tensor {e} is missing; copy or train it again") from None
+            raise WeightsError(
+                f"{path}: tensor {e} is missing; copy the file again, or train again"
+            ) from None
         fan_in = layers[-1][0].shape[0] if layers else matrix.shape[-1] if matrix.ndim else 0
         if matrix.ndim != 2 or matrix.shape[1] != fan_in or bias.shape != matrix.shape[:1]:
             raise WeightsError(
-                f"{path}: layer {number} has shapes {matrix.shape} and {bias.shape}, which do not fit"
+                f"{path}: layer {number} has weights of shape {matrix.shape} and biases of shape {bias.shape}, which "
+                "do not fit together; train again"
             )
         if not (np.isfinite(matrix).all() and np.isfinite(bias).all()):
             raise WeightsError(f"{path}: layer {number} holds numbers that are not finite; train again")
         layers.append((matrix, bias))
     if [m.shape[0] for m, _ in layers[:-1]] != header.hidden:
         raise WeightsError(
-            f"{path}: its hidden layers do not have the widths {header.hidden} of its metadata; train again"
+            f"{path}: the hidden layers do not have the widths {header.hidden} that the metadata states; train again"
         )
     return layers

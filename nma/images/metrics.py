@@ -126,7 +126,7 @@ def difference_image(
     elif kind == "signed":
         colours = colormaps["RdBu_r"](np.clip(0.5 + 0.5 * (a - b).mean(axis=2) / scale, 0.0, 1.0))
     else:
-        raise ImageError(f"difference_image: unknown kind {kind!r}; take flip, absolute or signed")
+        raise ImageError(f"difference_image: unknown kind {kind!r}; choose flip, absolute or signed")
     return (colours[..., :3] * 255.0 + 0.5).astype(np.uint8)
 
 

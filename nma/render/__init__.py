@@ -49,7 +49,7 @@ def use(variant: str = "auto") -> str:
         raise ParamError(f"Mitsuba has no variant {variant!r}; it has {', '.join(mi.variants())}")
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise MissingDependencyError(
-            f"{variant} needs an NVIDIA GPU and its driver; run `nma doctor` for what is missing, or take llvm_ad_rgb"
+            f"{variant} needs an NVIDIA GPU and its driver; run `nma doctor` for what is missing, or choose llvm_ad_rgb"
         )
     if variant.startswith("llvm"):
         ensure_llvm()

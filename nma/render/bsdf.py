@@ -12,7 +12,7 @@ from nma.ops import Color, Vec3, minimum, select
 # The Mitsuba variants in which our Python BSDFs run. Other variants lack RGB colours or vectorised code.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 # Mitsuba's BSDFs that call one nested BSDF and return its result.
-_HAND_ON = ("TwoSidedBRDF", "NormalMap", "BumpMap")
+_WRAPPERS = ("TwoSidedBRDF", "NormalMap", "BumpMap")
 
 
 def define_base() -> type:
@@ -194,7 +194,7 @@ def _registered() -> list[Any]:
 def _inside_blends(everything: list[Any]) -> set[int]:
     inside: set[int] = set()
     for bsdf in everything:
-        if bsdf.class_name() not in _HAND_ON:
+        if bsdf.class_name() not in _WRAPPERS:
             inside |= {_serial(part) for part in _parts(bsdf)}
     return inside
 

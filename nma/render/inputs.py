@@ -289,7 +289,7 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
     if param.size > 1 or not isinstance(value, mi.Texture):
         raise ParamError(f"{name} chooses a channel of a texture for a parameter of one number; leave it out")
     if wanted not in COLOUR:
-        raise ParamError(f"{name} is {wanted!r}; take {either(COLOUR)}")
+        raise ParamError(f"{name} is {wanted!r}; choose {either(COLOUR)}")
     return COLOUR.index(wanted)
 
 
@@ -315,7 +315,7 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     if material.class_name != space.name:
         raise ParamError(
             f"material '{name}' is of class {material.class_name}, but this BSDF needs class {space.name}; "
-            f"take a material of class {space.name}, or an adapter of class {material.class_name}"
+            f"choose a material of class {space.name}, or an adapter of class {material.class_name}"
         )
     return {
         key: mi.load_dict(bitmap_texture(value.read(), scale=value.uv_scale))

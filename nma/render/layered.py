@@ -76,7 +76,7 @@ def define() -> type:
             return self._stack(si, front), front
 
         def _stack(self, si, active) -> Stack:
-            return layered_eval.settle(source.gather(self.inputs.columns(si, active)))
+            return layered_eval.match_index(source.gather(self.inputs.columns(si, active)))
 
         def _walk(self, stack, si, u, active):
             """The direction and the throughput of one walk."""

@@ -84,11 +84,11 @@ def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
         ParamError: no lighting has that name, or `hide_sun` is set and the lighting has no sun.
     """
     if lighting not in LIGHTINGS:
-        raise ParamError(f"unknown lighting {lighting!r}; take {either(LIGHTINGS)}")
+        raise ParamError(f"unknown lighting {lighting!r}; choose {either(LIGHTINGS)}")
     if lighting == "outdoors":
         return {"sky": _image(sky_radiance(0.0 if hide_sun else SUN_SCALE)), "lamp": _lamp()}
     if hide_sun:
-        raise ParamError(f"the {lighting} has no sun to hide; take lighting='outdoors'")
+        raise ParamError(f"the {lighting} has no sun to hide; choose lighting='outdoors'")
     return {"sky": _image(studio_radiance())}
 
 

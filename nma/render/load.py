@@ -43,7 +43,7 @@ def material_bsdf(
         TextureError: a texture cannot be read, or holds values that are not allowed.
     """
     if model not in MODELS:
-        raise ParamError(f"unknown model {model!r}; take {either(MODELS)}")
+        raise ParamError(f"unknown model {model!r}; choose {either(MODELS)}")
     if model == "nma":
         Adapter.load(adapter).check_class(material.class_name, material.name, str(adapter))
     elif material.class_name != LAYERED3.name:

@@ -40,7 +40,7 @@ def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) ->
     import mitsuba as mi
 
     if up not in AXES:
-        raise MeshError(f"the mesh's axis {up!r} cannot point up; take {either(AXES)}")
+        raise MeshError(f"the mesh's axis {up!r} cannot point up; choose {either(AXES)}")
     description = _description(Path(path))
     mesh = _load(description, path)
     if coordinates and not mesh.has_vertex_texcoords():

@@ -45,7 +45,7 @@ def render_passes(
     import mitsuba as mi
 
     if spp < 1:
-        raise ParamError(f"{spp} samples per pixel are too few; take at least 1")
+        raise ParamError(f"{spp} samples per pixel are too few; choose at least 1")
     if integrator is None and scene.integrator() is None:
         raise SceneError('the scene has no integrator; add one, <integrator type="path"/> for example')
     width, height = map(int, scene.sensors()[sensor].film().crop_size())
@@ -67,7 +67,7 @@ def check_size(size: tuple[int, int]) -> None:
     """Raises `ParamError` for pictures of more than `MOST_PIXELS` pixels, before memory is allocated."""
     if size[0] * size[1] > MOST_PIXELS:
         raise ParamError(
-            f"a picture of {size[0]} x {size[1]} pixels is too large; take at most {MOST_PIXELS:,} pixels, "
+            f"a picture of {size[0]} x {size[1]} pixels is too large; choose at most {MOST_PIXELS:,} pixels, "
             "16384 x 8192 for example"
         )
 

@@ -126,7 +126,7 @@ def resolve_camera(camera: str | Camera | None) -> Camera:
         return camera
     if camera not in CAMERAS:
         raise ParamError(
-            f"unknown camera {camera!r}; take {', '.join(CAMERAS)}, or a Camera(origin, target, fov)"
+            f"unknown camera {camera!r}; choose {', '.join(CAMERAS)}, or a Camera(origin, target, fov)"
         )
     return CAMERAS[camera]
 

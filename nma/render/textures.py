@@ -33,7 +33,7 @@ def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.
         TextureError: the size is below 16.
     """
     if size < 16:
-        raise TextureError(f"procedural_textures: size {size} is too small; take 16 or more")
+        raise TextureError(f"procedural_textures: size {size} is too small; choose 16 or more")
     rng = np.random.default_rng(seed)
     textures = {
         "alpha_bottom": _worn_metal(rng, size),

@@ -34,7 +34,7 @@ from nma.sources.base import Random, Walk, throughput
 from nma.sources.layered import Layered3, Stack
 
 # If the coat's index of refraction is below 1 + `INDEX_MATCHED`, single precision cannot represent the refraction, so
-# `settle` sets the index to 1.
+# `match_index` sets the index to 1.
 INDEX_MATCHED = 1e-3
 _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
 # The least weight of the cosine lobe in `lobes`, before the weights are normalised. The cosine lobe covers the
@@ -42,7 +42,7 @@ _ISOTROPIC_PHASE = 0.25 * ops.INV_PI
 LEAST_DIFFUSE = 0.03
 
 
-def settle(stack: Stack) -> Stack:
+def match_index(stack: Stack) -> Stack:
     """Sets the coat's index to exactly 1 if it is almost 1, as `evaluate` and `pdf` require."""
     return replace(stack, eta_top=dr.select(stack.eta_top < 1.0 + INDEX_MATCHED, 1.0, stack.eta_top))
 
@@ -50,8 +50,8 @@ def settle(stack: Stack) -> Stack:
 def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True) -> Color:
     """One unbiased estimate per lane of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
 
-    `stack` must come from `settle`. The integral of the estimate's expected value over a set of directions wo equals
-    the expected throughput that `nma.sources.base.walk` carries out of the material in these directions.
+    `stack` must come from `match_index`. The integral of the estimate's expected value over a set of directions wo
+    equals the expected throughput that `nma.sources.base.walk` carries out of the material in these directions.
     """
     there, back = _enter(stack, wi, rng), _enter(stack, wo, rng)
     there.alive = back.alive = there.alive & back.alive & active

@@ -56,7 +56,7 @@ def read(path: str | Path) -> dict[str, NDArray]:
     path = Path(path)
     fields = read_tensors(path)
     if "rgb" not in fields and "spectra" in fields:
-        raise SourceError(f"{path}: holds spectra; take the material's file whose name ends in _rgb.bsdf")
+        raise SourceError(f"{path}: holds spectra; choose the material's file whose name ends in _rgb.bsdf")
     for name, rank in _FIELDS.items():
         if name not in fields:
             raise SourceError(f"{path}: field '{name}' is missing; copy the file again")

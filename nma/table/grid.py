@@ -179,7 +179,7 @@ def check_class(found: str, wanted: str, reader: str, where: str = "") -> None:
     if found != wanted:
         simulated = f": `nma simulate --class {wanted}`" if wanted in sources.names() else ""
         raise TableError(
-            f"{where}the tables are of class {found}, but {reader} is for class {wanted}; take tables of class "
+            f"{where}the tables are of class {found}, but {reader} is for class {wanted}; choose tables of class "
             f"{wanted}{simulated}"
         )
 

@@ -69,7 +69,7 @@ def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POI
             "nma.table.ANISOTROPIC"
         )
     if points < 1 or points % _MULTIPLE:
-        raise TableError(f"cannot tabulate from {points} point(s) per bin; take a multiple of {_MULTIPLE}")
+        raise TableError(f"cannot tabulate from {points} point(s) per bin; choose a multiple of {_MULTIPLE}")
     mean = np.empty((grid.bins, 3), np.float32)
     error = np.empty_like(mean)
     for first in range(0, grid.bins, _BINS_PER_LAUNCH):

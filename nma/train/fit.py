@@ -93,4 +93,4 @@ def _fit_table(
 def _check_isotropy(name: str, isotropic: bool, recipe: Recipe) -> None:
     if isotropic == (recipe.target == "anisotropic"):
         kind = "isotropic" if isotropic else "anisotropic"
-        raise NmaError(f"{name} is {kind}; take a recipe whose target, encoding and grid are {kind}")
+        raise NmaError(f"{name} is {kind}; choose a recipe whose target, encoding and grid are {kind}")

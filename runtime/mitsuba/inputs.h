@@ -188,7 +188,7 @@ private:
         if (!input.texture || input.param.size > 1)
             Throw("%s chooses a channel of a texture for a parameter of one number; leave it out", name);
         const auto place = std::string_view("rgb").find(wanted);
-        if (wanted.size() != 1 || place == std::string_view::npos) Throw("%s is '%s'; take r, g or b", name, wanted);
+        if (wanted.size() != 1 || place == std::string_view::npos) Throw("%s is '%s'; choose r, g or b", name, wanted);
         return static_cast<int>(place);
     }
 
@@ -259,8 +259,8 @@ private:
         const auto text = [](Float x) { return tfm::format("%.7g", x); };
         const std::string x = text(found.x()), y = text(found.y()), z = text(found.z());
         const bool grey = p.size == 1 || (x == y && x == z);
-        const char* advice = trained_ ? ", the range that the adapter was trained on; set `clamp` to move it there"
-                                      : "; take a value in between";
+        const char* advice = trained_ ? ", the range that the adapter was trained on; set `clamp` to clamp such values"
+                                      : "; choose a value within this range";
         return tfm::format("%s is %s, allowed is %g .. %g%s", p.name, grey ? x : x + ", " + y + ", " + z, p.low, p.high,
                            advice);
     }
