@@ -73,8 +73,8 @@ def install_command() -> str:
 def version(path: str) -> int | None:
     """The major version of the libLLVM at `path`.
 
-    The version is 0 if the libLLVM is too old to tell its version (before 16), and None if the libLLVM cannot be
-    loaded.
+    The version is 0 if the libLLVM has no function that returns the version (before 16), and None if the libLLVM cannot
+    be loaded.
     """
     try:
         library = ctypes.CDLL(path)

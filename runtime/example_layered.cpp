@@ -8,8 +8,8 @@
 // - Evaluation alone: the directions to the lamp are drawn uniformly, so most of them miss the peak of a narrow lobe.
 // - Walks and evaluation: a path tracer combines the two estimates above by multiple importance sampling (Veach 1997,
 //   eq. 9.8). The weights of multiple importance sampling contain the density of a walk's direction, which has no
-//   closed form. The program uses `pdf` in its place. The mean stays the same, because the weights of both estimates
-//   use `pdf`, and the noise is small, because `pdf` is close to the density of a walk's direction.
+//   closed form. The program uses `pdf` instead of the unknown density. The mean stays the same, because the weights of
+//   both estimates use `pdf`, and the noise is small, because `pdf` is close to the density of a walk's direction.
 // - Samples of `sample`: blends and masks of materials compute weights from the densities of samples, so they need
 //   samples whose exact density is known. Directions that `sample` draws have exactly the density `pdf`.
 #include <cstdio>

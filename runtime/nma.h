@@ -93,7 +93,7 @@ public:
     // The parameter to which the number at `index` of the array `parameters` belongs.
     const SourceParam& parameter(int index) const { return weights_.parameters[owners_[index]]; }
 
-    // The count of numbers that the network returns for a query. These numbers describe a blend.
+    // The count of numbers that the network returns for a query. The numbers returned by the network describe a blend.
     int output_count() const { return preparation_.outputs; }
     InstructionSet instruction_set() const { return network_.instruction_set(); }
 
@@ -247,8 +247,8 @@ private:
     }
 
     // Fills in `Preparation::outputs_of_lanes`. Fields that the network does not set, and lanes without an instance,
-    // get the index of the first output of padding. `Network` pads the last layer by at least one neuron, so this
-    // output exists. The weights and the range of this output are 0, so its decoded value is 0.
+    // get the index of the first output of padding. `Network` pads the last layer by at least one neuron, so there is
+    // an output of padding. The weights and the range of the padding are 0, so the decoded value of the padding is 0.
     void lay_out_lanes() {
         const int size = static_cast<int>(places_.size()), per_pack = Blend<float>::PRINCIPLED_SIZE * LANES;
         const int zero = output_count();
@@ -295,7 +295,7 @@ private:
     Preparation preparation_{};
     std::vector<int> places_;            // for each number of an instance: its place in `Principled`
     std::vector<int> outputs_of_lanes_;  // `Preparation::outputs_of_lanes`
-    std::vector<std::size_t> owners_;    // for each number of the parameters: the index of its parameter
+    std::vector<std::size_t> owners_;    // for each number of the parameters: the index of the parameter
     std::unique_ptr<float[], detail::FreeAligned> ranges_;
     bool in_plane_ = false;
 };

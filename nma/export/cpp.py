@@ -152,7 +152,7 @@ def _statement(function: Function, node: ast.stmt) -> str:
 
 
 def _expression(function: Function, node: ast.expr, tightness: int = 0) -> str:
-    """The C++ expression. It is put in parentheses if its operator has a lower precedence than `tightness`."""
+    """The C++ expression, in parentheses if its operator has a lower precedence than `tightness`."""
     match node:
         case ast.Constant(value=int() | float() as number):
             return f"T({number!r})"

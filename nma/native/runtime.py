@@ -6,8 +6,8 @@
     wo, value, pdf = runtime.sample(brdfs, wi, u)
 
 Directions are unit vectors (n, 3) in the local frame, with z up. `wi` points towards the viewer. Call `eval_pdf` and
-`sample` with the `wi` that `prepare` got. If the adapter is isotropic, `wi` may have another azimuth, but must have the
-same cosine with the normal. All arrays are converted to float32.
+`sample` with the `wi` that `prepare` got. If the adapter is isotropic, the azimuth of `wi` may differ from that in
+`prepare`, but the cosine with the normal must be the same. All arrays are converted to float32.
 """
 
 from __future__ import annotations

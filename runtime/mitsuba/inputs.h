@@ -63,8 +63,8 @@ public:
         : trained_(trained), clamp_(trained && props.get<bool>("clamp", false)) {
         if (props.has_property("material"))
             Throw(
-                "only vectorised variants have the property `material`; give the parameters (`nma materials NAME` "
-                "shows them, nma.render.load.material_bsdf makes them)");
+                "only vectorised variants have the property `material`; give the parameters instead, which "
+                "`nma materials NAME` prints and nma.render.load.material_bsdf returns");
         for (const SourceParam& p : parameters) {
             if (!props.has_property(p.name)) Throw("no value for %s; give it a number, a colour or a texture", p.name);
             inputs_.push_back(read(props, p));
@@ -239,7 +239,8 @@ private:
         Throw("the texture of %s%s: %s%s", p.name, place, refusal(p, found), hint);
     }
 
-    // Whether the channels of each pixel are equal up to rounding. Twin of `is_coloured` in nma/materials/texture.py.
+    // Whether the channels of each pixel are equal up to rounding. The Python version is `is_coloured` in
+    // nma/materials/texture.py, which returns the opposite.
     static bool grey(const Texels& texels) {
         for (std::size_t k = 0; k < texels.numbers.size(); ++k) {
             const float first = texels.numbers[k - k % texels.channels];

@@ -169,10 +169,10 @@ private:
         return {drawn, seen(context, si, drawn.wo, s.value) / s.pdf};
     }
 
-    // The value that this plugin returns to Mitsuba. On a path from the camera, that is the argument `value`, which
-    // comes from the blend for the view direction `si.wi`. On a path from the light, the view direction is `wo`, so the
-    // function prepares a blend for `wo`. A blend is not reciprocal, so the blend for `si.wi` would make paths from the
-    // light and paths from the camera disagree.
+    // The value that this plugin returns to Mitsuba. On a path from the camera, the function returns the argument
+    // `value`, which was evaluated with the blend for the view direction `si.wi`. On a path from the light, the view
+    // direction is `wo`, so the function prepares a blend for `wo`. A blend is not reciprocal, so the blend for `si.wi`
+    // would make paths from the light and paths from the camera disagree.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

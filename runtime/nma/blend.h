@@ -133,7 +133,7 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
 
 // The index of the instance that `u` chooses. From `start` on, each instance has an interval whose length is the
 // probability of its `lobe`. The chosen instance is the one whose interval contains `u`. Moves `start` to the end of
-// that interval. Returns `count` if `u` lies beyond all intervals.
+// the chosen interval. Returns `count` if `u` lies beyond all intervals.
 template <class T>
 inline int chosen(const Blend<T>& blend, Lanes<T> LobeProbabilities<Lanes<T>>::* lobe, T u, T& start) {
     int k = 0;

@@ -332,8 +332,8 @@ inline Walk walk(const Stack& stack, const Vec& wi, Random& random) {
 }
 
 // The intermediate results of `pdf` that depend on wi only. `coat`, `bottom` and `diffuse` are the weights of three
-// lobes: the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The weights sum to
-// 1. `width` is the roughness (alpha) of the conductor's lobe, and `inside` is wi refracted into the coat.
+// lobes: the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. The sum of the
+// weights is 1. `width` is the roughness (alpha) of the conductor's lobe, and `inside` is wi refracted into the coat.
 struct Density {
     float coat, bottom, diffuse, width;
     Vec inside;

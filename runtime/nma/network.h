@@ -73,7 +73,7 @@ public:
     const NetworkView& view() const { return view_; }
 
     // The counts of a query's inputs and outputs, including the padding. The padding of the inputs must be 0. The
-    // outputs have at least one number of padding, and their whole padding is 0.
+    // padding of the outputs has at least one number, and all numbers of the padding are 0.
     int input_stride() const { return view_.layers[0].in; }
     int output_stride() const { return view_.layers[view_.depth - 1].width; }
 

@@ -44,7 +44,7 @@ struct SourceParam {
         const double slack = ROUNDING * minimum(high - low, 1.0);
         return is_finite(x) && x >= low - slack && x <= high + slack;
     }
-    // The number of the range that is nearest to x, or the lower end if x is NaN.
+    // The number in the range that is nearest to x, or the lower end if x is NaN.
     float clamped(float x) const {
         const float least = static_cast<float>(low);
         return is_nan(x) ? least : clip(x, least, static_cast<float>(high));
@@ -203,7 +203,7 @@ inline SourceParam source_param(const Json& entry) {
     return p;
 }
 
-// The field of `Principled` that has this name and this size.
+// The field of `Principled` that is called `name` and has `size` numbers.
 inline const Field& field(const std::string& name, int size) {
     for (const Field& f : FIELDS)
         if (f.name == name && f.size == size) return f;

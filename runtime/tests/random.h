@@ -8,7 +8,7 @@
 
 namespace nma::tests {
 
-// Uniform numbers in [0, 1). One number of 256 is an end of this range: 0, or the largest float below 1.
+// Uniform numbers in [0, 1). One of 256 numbers is an end of the range: 0, or the largest float below 1.
 class Random {
 public:
     explicit Random(unsigned seed) : engine_(seed) {}

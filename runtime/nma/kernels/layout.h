@@ -70,7 +70,7 @@ struct NetworkView {
 //
 // If in_plane[k] is 1 instead of 0, the decoded value is multiplied by sin^2(theta_i), which goes to 0 towards normal
 // incidence. The arrays have `count` numbers, a multiple of WIDTH_STEP. After the last output of the network, the
-// arrays have at least one zero. From index `logarithmic` on, all factors are 0.
+// arrays have at least one zero. From index `logarithmic` on, all factors are 0, so the decoding skips the power of 2.
 struct Ranges {
     int count, logarithmic;
     const float *start, *slope, *factor, *rate, *in_plane;

@@ -1,5 +1,5 @@
-// Attributes that compile a single function for an instruction set. The rest of the program is compiled without that
-// instruction set.
+// Attributes that compile a single function for an instruction set, such as AVX2, that the rest of the program does not
+// use.
 #pragma once
 
 #if defined(__clang__)
