@@ -124,6 +124,17 @@ def test_density_is_that_of_the_package_case_by_case(bridge):
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
+def test_a_coat_is_matched_if_its_index_is_below_1_001(bridge):
+    """A matched coat does not reflect light, so that its index does not change the density."""
+    wi, wo = (random_views(np.random.default_rng(seed), 50).astype(np.float32) for seed in (1, 2))
+
+    def density(eta):
+        return bridge("layered_pdf", (vector(CASES["index_matched"] | {"eta_top": eta}), wi[0], wo), (50,))
+
+    np.testing.assert_array_equal(density(1.00099), density(1.0))
+    assert (density(1.00101) != density(1.0)).any()
+
+
 def test_samples_are_those_of_the_package(bridge):
     u = np.random.default_rng(0).random((4000, 3), np.float32)
     for values in (*CASES.values(), NARROW):
