@@ -347,8 +347,8 @@ private:
     std::vector<Brdf> nodes_;
 };
 
-// Call `Brdf::eval_pdf` or `Brdf::sample` for many shading points. `u` has three uniform numbers for each shading
-// point.
+// `Brdf::eval_pdf` and `Brdf::sample` for many shading points. The argument `u` has three uniform numbers for each
+// shading point.
 inline void eval_pdf_many(int count, const Brdf* brdfs, const Direction* wi, const Direction* wo, Value* values) {
     for (int k = 0; k < count; ++k) values[k] = brdfs[k].eval_pdf(wi[k], wo[k]);
 }

@@ -74,8 +74,8 @@ NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, 
 NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters,
                                 const float* cos_theta_i, nma_brdf* brdfs);
 
-/* `nma_prepare` and `nma_prepare_many` for directions `wi`, which have three floats each. Isotropic adapters read only
- * z. */
+/* These functions do what `nma_prepare` and `nma_prepare_many` do, but take directions `wi` of three floats each instead
+ * of cosines. Isotropic adapters read only z. */
 NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi,
                                      nma_brdf* brdf);
 NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters,

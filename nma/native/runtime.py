@@ -6,7 +6,7 @@
     wo, value, pdf = runtime.sample(brdfs, wi, u)
 
 Directions are unit vectors (n, 3) in the local frame, with z up. `wi` points towards the viewer. Call `eval_pdf` and
-`sample` with the `wi` that `prepare` got. If the adapter is isotropic, the azimuth of `wi` may differ from that in
+`sample` with the same `wi` as `prepare`. If the adapter is isotropic, the azimuth of `wi` may differ from that in
 `prepare`, but the cosine with the normal must be the same. All arrays are converted to float32.
 """
 

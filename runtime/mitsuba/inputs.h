@@ -25,9 +25,9 @@ struct Input {
 
     SourceParam param;
     ref<Texture> texture;
-    // `shown` holds the numbers that `mi.traverse` returns. `value` holds the numbers that were last checked, moved
-    // into the range of the parameter. If a texture object is shared, another owner may edit the texture without a call
-    // to this input, and then `value` is out of date.
+    // `shown` holds the numbers that `mi.traverse` returns. `value` holds the numbers of the last check, clamped to the
+    // range of the parameter. If a texture object is shared, another owner may edit the texture without a call to this
+    // input, and then `value` is out of date.
     Colour value, shown;
     // For a parameter of one number: the index of the texture channel that the parameter reads, or -1 if no channel was
     // chosen.
@@ -56,7 +56,7 @@ public:
     using Colour = typename Input::Colour;
 
     // Reads one input for each of `parameters` from the properties, and checks the input against the range of the
-    // parameter. `trained` says that the ranges are training ranges. For training ranges, the property `clamp` moves
+    // parameter. `trained` says whether the ranges are training ranges. For training ranges, the property `clamp` moves
     // numbers into the range instead of rejecting them. Numbers that are known only during rendering (mesh attributes)
     // are always moved into the range.
     Inputs(const Properties& props, const std::vector<SourceParam>& parameters, bool trained)

@@ -31,7 +31,7 @@ NMA_OP Vec sub(Vec a, Vec b) { return _mm512_sub_ps(a, b); }
 NMA_OP Vec mul(Vec a, Vec b) { return _mm512_mul_ps(a, b); }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a, b, c); }
 // The instruction `rcp14` estimates 1 / a with 14 correct bits, and one Newton step doubles the count of correct bits.
-// A division would take twice as long.
+// A division would take twice as long as the estimate and the Newton step.
 NMA_OP Vec inverse(Vec a) {
     const Vec near = _mm512_maskz_rcp14_ps(ALL, a);
     return fma(near, _mm512_fnmadd_ps(a, near, set(1.0f)), near);

@@ -21,7 +21,7 @@
 
 // Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first of these neurons. Each
 // neuron has SUMS partial sums, because each addition to a single sum would wait for the addition before it. PAIRS says
-// whether the weights are `LayerView::pairs` instead of `LayerView::columns`.
+// whether the function reads the weights from `LayerView::pairs` instead of `LayerView::columns`.
 template <int VECTORS, int QUERIES, int SUMS, bool PAIRS>
 NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                         bool relu) {
