@@ -55,8 +55,8 @@ NMA_C_API int nma_parameter_count(const nma_adapter* adapter);
  * array `parameters` belongs. `index` must be at least 0 and less than nma_parameter_count. */
 NMA_C_API const char* nma_parameter_name(const nma_adapter* adapter, int index);
 NMA_C_API void nma_parameter_range(const nma_adapter* adapter, int index, float range[2]);
-/* Whether the adapter was fitted to a single material. If so, the function also writes the parameters of the material
- * to `parameters`. */
+/* Whether the adapter was fitted to a single material. For a single material, the function also writes
+ * the parameters of the material to `parameters`. */
 NMA_C_API int nma_single_material(const nma_adapter* adapter, float* parameters);
 /* The index of the first number that is not allowed, or -1 if all numbers are allowed. A number is allowed if it is
  * finite and lies in its training range. Outside the training range, the BRDF does not match the source material. If
@@ -74,8 +74,8 @@ NMA_C_API void nma_prepare(const nma_adapter* adapter, const float* parameters, 
 NMA_C_API void nma_prepare_many(const nma_adapter* adapter, int count, const float* parameters,
                                 const float* cos_theta_i, nma_brdf* brdfs);
 
-/* These functions do what `nma_prepare` and `nma_prepare_many` do, but take directions `wi` of three floats each instead
- * of cosines. Isotropic adapters read only z. */
+/* These functions do what `nma_prepare` and `nma_prepare_many` do, but take directions `wi` of three floats each
+ * instead of cosines. Isotropic adapters read only z. */
 NMA_C_API void nma_prepare_direction(const nma_adapter* adapter, const float* parameters, const float* wi,
                                      nma_brdf* brdf);
 NMA_C_API void nma_prepare_direction_many(const nma_adapter* adapter, int count, const float* parameters,

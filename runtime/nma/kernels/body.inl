@@ -69,8 +69,8 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
     }
 }
 
-// Computes all neurons of a layer from index `first` on, in tiles of VECTORS vectors. If the last neurons are too few
-// for a tile, tiles of half the size compute them.
+// Computes all neurons of a layer from index `first` on, in tiles of VECTORS vectors. If fewer neurons remain than a
+// tile has, they are computed in tiles of half the size.
 template <int VECTORS, int QUERIES, bool PAIRS>
 NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                          bool relu) {

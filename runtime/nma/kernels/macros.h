@@ -1,4 +1,4 @@
-// Attributes that compile a single function for an instruction set, such as AVX2, that the rest of the program does not
+// Attributes that compile a single function for an instruction set, such as AVX2, that the rest of the program need not
 // use.
 #pragma once
 
