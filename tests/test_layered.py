@@ -39,9 +39,9 @@ def fixed(mu, n):
 
 
 def test_a_coat_is_matched_if_its_index_is_below_1_001():
-    for eta, settled in ((1.00099, 1.0), (1.00101, 1.00101)):
+    for eta, expected in ((1.00099, 1.0), (1.00101, 1.00101)):
         layers = layers_of(CASES["white_coated"] | {"eta_top": eta}, 1)
-        assert layers.eta_top.numpy()[0] == np.float32(settled)
+        assert layers.eta_top.numpy()[0] == np.float32(expected)
 
 
 def draw(layers, wi, rng):

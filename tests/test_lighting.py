@@ -157,7 +157,7 @@ def test_clamping_only_darkens_and_removes_fireflies():
     [
         ({"type": "ptracer"}, "if each sample is one path"),
         ({"type": "prb"}, "if each sample is one path"),
-        ({"type": "aov", "aovs": "n:sh_normal"}, "beside other channels"),
+        ({"type": "aov", "aovs": "n:sh_normal"}, "also writes other channels"),
     ],
 )
 def test_clamping_is_refused_for_integrators_whose_samples_are_not_paths(integrator, message):

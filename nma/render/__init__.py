@@ -31,9 +31,9 @@ def use(variant: str = "auto") -> str:
     """Choose Mitsuba's variant and return its name.
 
     Args:
-        variant: one of `mi.variants()`, or "auto": cuda_ad_rgb where there is an NVIDIA GPU, else llvm_ad_rgb. This
-            package's BSDFs run in llvm_ad_rgb, cuda_ad_rgb and scalar_rgb. The plugins for scalar_rgb are compiled when
-            scalar_rgb is first chosen.
+        variant: one of `mi.variants()`, or "auto", which means cuda_ad_rgb on a machine with an NVIDIA GPU, and
+            otherwise llvm_ad_rgb. This package's BSDFs run in llvm_ad_rgb, cuda_ad_rgb and scalar_rgb. The plugins for
+            scalar_rgb are compiled when scalar_rgb is first chosen.
 
     Raises:
         ParamError: Mitsuba has no variant of this name.
@@ -49,7 +49,8 @@ def use(variant: str = "auto") -> str:
         raise ParamError(f"Mitsuba has no variant {variant!r}; it has {', '.join(mi.variants())}")
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise MissingDependencyError(
-            f"{variant} needs an NVIDIA GPU and its driver; run `nma doctor` for what is missing, or choose llvm_ad_rgb"
+            f"{variant} needs an NVIDIA GPU and its driver; run `nma doctor` to see what is missing, or choose "
+            "llvm_ad_rgb"
         )
     if variant.startswith("llvm"):
         ensure_llvm()

@@ -1,14 +1,14 @@
-"""Mitsuba 3 BSDF `nma`: a source material, evaluated by its adapter as a blend of Principled BRDFs.
+"""Mitsuba 3 BSDF `nma`: a material that its adapter evaluates as a blend of Principled BRDFs.
 
-The network maps source parameters and cos(theta_i) to the parameters of the blend, which is then evaluated and sampled.
-Without textures the network runs only when the scene is loaded, and the blend's parameters are stored as curves over
-cos(theta_i). With textures, and for anisotropic adapters, the network runs once per shading point. `nma.render.inputs`
-reads the source parameters. The BSDF is one-sided; wrap it in `twosided` if needed.
+The network maps the material's parameters and the view direction to the parameters of the blend, which is then
+evaluated and sampled. Without textures the network runs only when the scene is loaded, and the blend's parameters are
+stored as curves over cos(theta_i). With textures, and for anisotropic adapters, the network runs once per shading
+point. `nma.render.inputs` reads the material's parameters. The BSDF is one-sided; wrap it in `twosided` if needed.
 
 The property `adapter` is the name of a shipped adapter or a weights file. With `clamp`, parameters outside the
-adapter's training range are clamped to that range instead of refused. Further properties are the parameters of the
-adapter's class, or a `material` that has them. An adapter of a single material needs no parameters, and refuses the
-parameters of another material.
+adapter's training range are clamped to that range instead of rejected. Further properties are the parameters of the
+adapter's class, or the name of a `material` of this class. An adapter of a single material needs no parameters, and
+rejects the parameters of another material.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def define() -> type:
 
     mi: Any = mitsuba  # Mitsuba's types change with the variant
 
-    probe = mi.Float(0.0)  # its gradients are enabled wherever gradients are not suspended
+    probe = mi.Float(0.0)  # `dr.grad_enabled(probe)` is false inside `dr.suspend_grad`
     dr.enable_grad(probe)
 
     class Nma(define_base()):  # type: ignore[misc]
@@ -56,7 +56,7 @@ def define() -> type:
         def parameters_changed(self, keys: Any = ()) -> None:
             try:
                 super().parameters_changed(keys)
-            finally:  # bad edits were undone, but other parameters may have changed
+            finally:  # also after an error, because only the invalid edits are undone
                 if self._curves is not None:
                     self._curves.update(self.inputs.columns())
 
@@ -95,8 +95,9 @@ def define() -> type:
         def _towards_camera(self, si, wo, active) -> Color:
             """f cos(theta_o) for light that arrives from `si.wi` and leaves towards the camera along `wo`.
 
-            Here the view direction is `wo`, so the BRDF is prepared for `wo`. Paths from the light thus get the same
-            values as paths from the camera, although the BRDF is not reciprocal. Samples are still drawn for `si.wi`.
+            For a path from the light, the view direction is `wo`, so the BRDF is prepared for `wo`. Thus, paths from
+            the light get the same values as paths from the camera, although the BRDF is not reciprocal. Samples are
+            still drawn for `si.wi`.
             """
             turned = mi.SurfaceInteraction3f(si)
             turned.wi = wo
@@ -144,8 +145,8 @@ def define() -> type:
 
 
 def load_once(name_or_path: str) -> Adapter:
-    """Loads an adapter by its name or weights file. BSDFs of the same file share the adapter while the file does not
-    change."""
+    """Loads an adapter by its name or from a weights file. BSDFs that name the same file share one `Adapter`, unless
+    the file changes."""
     path = weights_file(name_or_path)
     stat = Path(path).stat() if Path(path).is_file() else None
     return _loaded(name_or_path, (stat.st_mtime_ns, stat.st_size) if stat else None)
@@ -164,8 +165,8 @@ class _Query(NamedTuple):
     gradients: bool  # false inside `dr.suspend_grad`
 
     def identity(self) -> list[int]:
-        """Numbers that are equal for two queries only if both queries have the same variables and were made in the same
-        scope."""
+        """A list that is equal for two queries only if the queries have the same Dr.Jit variables, the same scope and
+        the same value of `gradients`."""
         from nma.jit import dr
 
         scope = dr.detail.scope(dr.backend_v(self.si.wi))
@@ -183,12 +184,13 @@ class _LastBrdf:
     variables. A BRDF with derivatives must not be kept, because the next backward pass would reach variables that no
     longer exist.
 
-    The next call takes the BRDF if that call makes the same query in the same scope, and otherwise deletes the BRDF. In
-    another scope the BRDF's variables may not exist, because Dr.Jit records all BSDFs of a scene with the same
-    arguments, each in a new scope. `keep` opens a new scope too, so only a call directly after `keep` can take the
+    The next call reuses the BRDF if that call makes the same query in the same scope, and otherwise deletes the BRDF.
+    In another scope the BRDF's variables may not exist, because Dr.Jit records all BSDFs of a scene with the same
+    arguments, each in a new scope. `keep` opens a new scope too, so only a call directly after `keep` can reuse the
     BRDF.
 
-    Frozen functions do not look into this class, because they must not find variables of a kernel under recording.
+    This class does not declare its fields to Dr.Jit, because frozen functions must not find variables of a kernel that
+    is still being recorded.
     """
 
     def __init__(self) -> None:

@@ -19,10 +19,10 @@ def define_base() -> type:
     """The base class of all our BSDFs, for Mitsuba's current variant.
 
     A subclass defines `eval_pdf`, `sample` and `_albedo`. If a subclass has `inputs` (`nma.render.inputs.Inputs`),
-    `mi.traverse` and attributes list these inputs, and `differentiable` says whether the inputs have derivatives. A
-    subclass calls this `__init__` last, after everything that can fail, because this `__init__` registers the BSDF in
-    Dr.Jit. Dr.Jit calls a registered BSDF in all scenes until the BSDF is destroyed, and a traceback could keep a BSDF
-    alive whose `__init__` failed later.
+    `mi.traverse` and the BSDF's attributes list these inputs, and `differentiable` says whether the inputs have
+    derivatives. A subclass calls this `__init__` last, after everything that can fail, because this `__init__`
+    registers the BSDF in Dr.Jit. Dr.Jit calls a registered BSDF in all scenes until the BSDF is destroyed. If the
+    subclass's `__init__` failed after the registration, a traceback could keep the incomplete BSDF alive.
     """
     import mitsuba
 
@@ -39,8 +39,8 @@ def define_base() -> type:
             self.serial = next(_serials)
 
         def _declare(self, *flags: mi.BSDFFlags) -> None:
-            """Declares one component: glossy reflection on the front, with further `flags`, and with the flag of
-            textures if there are textures."""
+            """Declares one component: glossy reflection on the front side, with the given `flags`, and
+            `SpatiallyVarying` if an input is textured."""
             both = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             if self.inputs is not None and self.inputs.textured:
                 both |= mi.BSDFFlags.SpatiallyVarying
@@ -117,7 +117,7 @@ def define_base() -> type:
 def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, active: Any = True) -> Color:
     """The mean of draw(k, u1, u2, u3) over the points k = 0, 1, ..., points - 1 of the unit cube.
 
-    All lanes use the same points, so the mean has no noise, but a small error.
+    All lanes use the same points, so the mean has a small error, but no noise.
     """
     import mitsuba
 
@@ -161,8 +161,8 @@ def blended(bsdf: Any) -> bool:
     return bsdf.serial in _blends[1]
 
 
-# Unique ids of our BSDFs. Addresses and names are not unique, because scenes that are loaded one after another may
-# reuse them.
+# Generates the unique ids of our BSDFs. Addresses and names are not unique, because scenes that are loaded one after
+# another may reuse them.
 _serials = count(1)
 # The cache of `blended`: a description of all BSDFs at its last call, and the ids of our BSDFs inside a blend.
 _blends: tuple[list[Any], set[int]] = [], set()
@@ -220,7 +220,8 @@ def _parts(bsdf: Any) -> list[Any]:
         def put_object(self, name, value, flags):
             if isinstance(value, mi.BSDF):
                 found.append(value)
-                # A new object, because nanobind does not call a method of an object from within the same method.
+                # A new `Parts` is needed, because nanobind does not call a method of an object from within the same
+                # method.
                 value.traverse(Parts())
 
     bsdf.traverse(Parts())

@@ -16,7 +16,8 @@ from nma.target.decode import numbers
 # the curves changed BRDF values by 1e-4 on average, at directions sampled from the blend, and albedos by 1e-5. Nodes
 # that lie closer at grazing angles gave about the same errors.
 NODES = 128
-# How many numbers one gather fetches. Dr.Jit can fetch a power of two at once, so 24 numbers take three gathers of 8.
+# The count of numbers that one gather fetches. Dr.Jit can fetch a block of numbers at once if the length of the block
+# is a power of two, so 24 numbers need three gathers of 8.
 PACKET = 8
 # Smaller cosines are replaced by this value, so that no adapter is evaluated exactly at the horizon.
 MIN_COS = 1e-4
@@ -26,8 +27,8 @@ class Curves:
     """The numbers that describe a blend (`nma.target.numbers`), stored for fixed cosines and linearly interpolated
     between these nodes.
 
-    Every interpolated list of numbers describes a valid blend. Derivatives with respect to the source parameters come
-    from tables of slopes, because neither forward derivatives nor frozen functions of Dr.Jit could trace the
+    Every interpolated list of numbers describes a valid blend. Derivatives with respect to the material's parameters
+    come from tables of slopes, because neither forward derivatives nor frozen functions of Dr.Jit could trace the
     computation of the curves.
     """
 
@@ -60,12 +61,13 @@ class Curves:
         }
 
     def at(self, wi: Vec3, columns: Sequence[Float], active: Any = True) -> Brdf:
-        """The BRDF for the view direction `wi`. The derivatives need `columns`, the parameters for which the curves
-        were computed."""
+        """The BRDF for the view direction `wi`. `columns` are the parameters for which the curves were computed; they
+        are needed only for derivatives."""
         flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
-                change = columns[k] - dr.detach(columns[k])  # zero, but with the derivative of columns[k]
+                # The value of `change` is 0, but its derivative is that of columns[k].
+                change = columns[k] - dr.detach(columns[k])
                 steps = self._looked_up(slope, wi.z, active)
                 flat = [number + step * change for number, step in zip(flat, steps, strict=True)]
         return self.adapter.from_numbers(flat, wi)

@@ -1,4 +1,5 @@
-"""The demonstration: reference, adapter and their difference, without and with textures, and the cost of each."""
+"""The demonstration: pictures of the reference, of the adapter and of their difference, for a material without textures
+and a material with textures, and a table of times and errors."""
 
 from __future__ import annotations
 
@@ -51,8 +52,8 @@ class Settings(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A scene of the demonstration: the material's name, its label in the sheet, and a Mitsuba dictionary for each BSDF
-    name."""
+    """A scene of the demonstration: the material's name, the label of its pictures, and a Mitsuba dictionary for each
+    BSDF name."""
 
     material: str
     label: str
@@ -60,7 +61,7 @@ class Scene(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A picture (height, width, 3), and the seconds for which it was rendered, including compilation."""
+    """A picture (height, width, 3), and the time in seconds that its rendering took, including compilation."""
 
     image: NDArray[np.float64]
     seconds: float
@@ -91,10 +92,11 @@ def demo(
     progress: Progress = lambda what, samples: None,
     published: Callable[[str], None] = lambda shown: None,
 ) -> list[Line]:
-    """Render the demonstration and write its sheet: first with few samples, then again after each scene is measured.
+    """Render the demonstration and write its contact sheet: first with few samples, then again after each scene is
+    measured.
 
     Args:
-        path: the PNG file of the sheet, written atomically each time.
+        path: the PNG file of the contact sheet, written atomically each time.
         progress: called after each frame or pass with the name of the picture and the samples per pixel of this frame
             or pass.
         published: called each time the PNG has been written, with a description of its new content.
@@ -201,7 +203,7 @@ def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[
 def _measured(
     scene: Scene, first: dict[str, Frame], settings: Settings, progress: Progress
 ) -> tuple[NDArray[np.float32], list[Line]]:
-    """Returns the reference picture, which has a seed of its own, and the table's line for each BSDF."""
+    """Returns the reference picture, which is rendered with other random seeds, and the table's line for each BSDF."""
     truth = render_passes(
         _load(scene.bsdfs["layered"], settings),
         settings.reference_spp,

@@ -28,7 +28,9 @@ def clamped(integrator: Any, limit: float) -> Any:
         )
     if integrator.aov_names():
         others = ", ".join(integrator.aov_names())
-        raise ParamError(f"samples cannot be clamped beside other channels ({others}); render colours only")
+        raise ParamError(
+            f"samples cannot be clamped if the integrator also writes other channels ({others}); render colours only"
+        )
 
     class Clamped(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):

@@ -1,4 +1,4 @@
-"""Checks whether numbers and pixels are allowed for a parameter, and makes the error messages."""
+"""Checks whether numbers and pixels are allowed for a parameter, and writes the error messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nma.params import Param, Range
 
 
 class Allowed(NamedTuple):
-    """The allowed values of a parameter: its range, or with `clamp` all finite numbers."""
+    """The allowed values of a parameter: the numbers in its range, or with `clamp` all finite numbers."""
 
     param: Param
     range: Range

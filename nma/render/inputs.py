@@ -1,4 +1,5 @@
-"""The parameters of a material as inputs of a Mitsuba BSDF: numbers, colours or textures, checked when loaded."""
+"""The parameters of a material as inputs of a Mitsuba BSDF: numbers, colours or textures, which are checked when the
+scene is loaded."""
 
 from __future__ import annotations
 
@@ -24,12 +25,13 @@ class Inputs:
     property `material` is the name of a shipped material or a `.toml` file. The values of this material are used for
     the parameters that are not given.
 
-    `values` maps each name to a `mi.Float` (size 1), a `mi.Color3f` (size 3) or a `mi.Texture`. Numbers and pixels must
-    be finite and within `bounds`; with `clamp`, finite values are clamped to the bounds instead. Values that are not
-    known before rendering (mesh attributes, edits inside frozen functions) are always clamped.
+    `values` maps the name of each parameter to a `mi.Float` (size 1), a `mi.Color3f` (size 3) or a `mi.Texture`.
+    Numbers and pixels must be finite and within `bounds`; with `clamp`, finite values are clamped to the bounds
+    instead. Values that are not known before rendering (mesh attributes, edits inside frozen functions) are always
+    clamped.
 
-    Kernels read the numbers from memory, so an edit compiles nothing, and materials with the same textured parameters
-    share a kernel.
+    Kernels read the numbers from memory, so an edit does not cause a recompilation, and materials with the same
+    textured parameters share a kernel.
     """
 
     # Frozen functions of Dr.Jit look for variables in these fields.
@@ -45,7 +47,7 @@ class Inputs:
         if missing:
             raise ParamError(
                 f"class {space.name}: no value for {', '.join(missing)}; give each a number, a colour or a texture, "
-                "or name a `material` that has them (`nma materials` lists the shipped ones)"
+                "or name a `material` that has them (`nma materials` lists the shipped materials)"
             )
         self.values = {param.name: _value(param, given[param.name]) for param in space.params}
         self.chosen = {param.name: _channel(param, props, self.values[param.name]) for param in space.params}
@@ -54,7 +56,7 @@ class Inputs:
 
     @property
     def textured(self) -> tuple[str, ...]:
-        """Names of the parameters that are given by a texture."""
+        """The names of the parameters whose values come from textures."""
         import mitsuba as mi
 
         return tuple(name for name, value in self.values.items() if isinstance(value, mi.Texture))
@@ -94,7 +96,8 @@ class Inputs:
         """Checks the textures, and with `numbers` all inputs, that have changed since the last check.
 
         Raises `ParamError` or `TextureError` for a bad value, and restores the last good value first. A bad value must
-        not stay, because Dr.Jit records all existing BSDFs, so the error would also stop other scenes.
+        not stay, because Dr.Jit records all existing BSDFs into its kernels, so the error would also stop the rendering
+        of other scenes.
 
         BSDFs call this method wherever they use inputs, because Mitsuba does not report edits of a texture that several
         BSDFs share. While Dr.Jit freezes a function, values cannot be read, so edited values are clamped to the bounds
@@ -136,12 +139,13 @@ class Inputs:
 
         for value in self.values.values():
             if not isinstance(value, mi.Texture):
-                dr.make_opaque(value)  # Mitsuba sets literals, which would be compiled into the kernel
+                # Mitsuba stores edited numbers as literals, which would be compiled into the kernel.
+                dr.make_opaque(value)
         self.check(numbers=True)
 
 
 def of_adapter(adapter: Adapter, props: Any) -> Inputs:
-    """The inputs of an adapter: the parameters of its class, or none for an adapter of a single material.
+    """The inputs of an adapter: the parameters of its class, or no inputs for an adapter of a single material.
 
     Raises `ParamError` if parameters of another material are given to an adapter of a single material.
     """
@@ -155,7 +159,7 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
     for name, value in given.items():
         if isinstance(value, mi.Texture):
             raise ParamError(
-                f"the adapter was trained for a single material, so {name} cannot be textured; leave it out"
+                f"the adapter was trained for a single material, so {name} cannot be textured; leave {name} out"
             )
         whole = known.copy()
         whole[adapter.space.slices[name]] = value
@@ -211,7 +215,7 @@ class _Seen:
 
 
 def _known(key: str) -> bool:
-    """Whether `key`, a key of `mi.traverse`, stands for the pixels or the value of a texture."""
+    """Whether `key`, a key of `mi.traverse`, is that of the pixels or of the value of a texture."""
     return key.rpartition(".")[2] in ("data", "value")
 
 
@@ -287,7 +291,9 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
         return None
     wanted = props[name]
     if param.size > 1 or not isinstance(value, mi.Texture):
-        raise ParamError(f"{name} chooses a channel of a texture for a parameter of one number; leave it out")
+        raise ParamError(
+            f"{name} chooses a channel of a texture for a parameter of one number; leave {name} out"
+        )
     if wanted not in COLOUR:
         raise ParamError(f"{name} is {wanted!r}; choose {either(COLOUR)}")
     return COLOUR.index(wanted)

@@ -5,8 +5,8 @@ bits of its arguments. The density of the simulated walks is unknown, so `pdf` a
 density. Multiple importance sampling stays unbiased, because the reported density is positive wherever f is positive,
 and `pdf` and `sample` report the same density.
 
-`sample` simulates one random walk. BSDFs that blend others (`blendbsdf`, `mask`) assume that weight times pdf is the
-value of f, which is wrong for a walk. Inside a blend, `sample` draws a direction from `pdf`, and its weight is an
+`sample` simulates one random walk. BSDFs that blend other BSDFs (`blendbsdf`, `mask`) assume that weight times pdf is
+the BRDF value, which is wrong for a walk. Inside a blend, `sample` draws a direction from `pdf`, and its weight is an
 estimate of the value divided by `pdf`. Drawing from `pdf` is unbiased in every BSDF, but slower than a walk, and has 1
 to 1.4 times the variance of a walk.
 
@@ -26,7 +26,7 @@ from nma.sources.base import walk
 from nma.sources.layered import Layered3, Stack
 
 # The albedo at a point is the mean of this many walks. The walks have the same random numbers at all points, so the
-# albedo has no noise, but an error of up to .06.
+# albedo has an error of up to .06, but no noise.
 ALBEDO_WALKS = 128
 
 

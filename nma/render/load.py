@@ -16,7 +16,7 @@ from nma.params import LAYERED3
 from nma.render.adapter_bsdf import DEFAULT_ADAPTER
 from nma.render.textures import bitmap_texture
 
-# The file name endings of the image formats that Mitsuba reads.
+# The file extensions of the image formats that Mitsuba reads.
 _IMAGES = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 
 MODELS = ("nma", "layered")
@@ -29,13 +29,13 @@ class SceneError(NmaError, RuntimeError):
 def material_bsdf(
     material: Material, model: str = "nma", *, adapter: str | Path = DEFAULT_ADAPTER, clamp: bool = False
 ) -> dict[str, Any]:
-    """The Mitsuba dictionary of a source material.
+    """The Mitsuba dictionary of a material.
 
     Args:
         material: returned by `nma.materials.load`. The textures of the material are read and checked here.
         model: "nma" (the adapter) or "layered" (the reference).
         adapter: name of a shipped adapter or a weights file, for "nma".
-        clamp: whether parameters outside the adapter's training range are clamped to that range instead of refused.
+        clamp: whether parameters outside the adapter's training range are clamped to that range instead of rejected.
 
     Raises:
         ParamError: the model is unknown, or the material is of another class than the adapter or than "layered".
@@ -89,7 +89,7 @@ def load_scene(
     except RuntimeError as error:
         raise SceneError(one_line(str(error))) from error
     if not isinstance(scene, mi.Scene):
-        raise SceneError(f"{path} holds no scene; its outermost element must be <scene>")
+        raise SceneError(f"{path} contains no scene; the outermost element must be <scene>")
     if not scene.sensors():
         raise SceneError(f"{path} has no sensor; add a <sensor>")
     if size:

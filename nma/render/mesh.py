@@ -14,7 +14,7 @@ from nma.errors import NmaError, either, one_line
 
 KINDS = {".ply": "ply", ".obj": "obj"}
 AXES = ("z", "y")
-WIDTH, HEIGHT = 2.0, 2.12  # the size of the shader ball, to which the mesh is scaled
+WIDTH, HEIGHT = 2.0, 2.12  # size of the shader ball; the mesh is scaled to this size
 LIFT = 1e-3  # height of the mesh above the floor, so that flat meshes are visible
 ATTRIBUTES = {"positions": 3, "normals": 3, "texcoords": 2}
 
@@ -24,7 +24,7 @@ class MeshError(NmaError, ValueError):
 
 
 def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) -> dict[str, Any]:
-    """Mitsuba's dictionary of a mesh that is moved to the place of the shader ball and scaled to its size.
+    """Mitsuba's dictionary of a mesh that is moved to the place of the shader ball and scaled to the ball's size.
 
     Normals and texture coordinates come from the file. Mitsuba computes the normals if the file has none.
 
@@ -45,7 +45,7 @@ def mesh_shape(path: str | Path, *, up: str = "z", coordinates: bool = False) ->
     mesh = _load(description, path)
     if coordinates and not mesh.has_vertex_texcoords():
         raise MeshError(
-            f"mesh {path} has no texture coordinates (UVs), which this material needs; unwrap it first"
+            f"mesh {path} has no texture coordinates (UVs), which this material needs; UV-unwrap the mesh first"
         )
     to_world = mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0 if up == "y" else 0.0)
     points = _points(mesh, path) @ np.array(to_world.matrix)[:3, :3].T
@@ -77,7 +77,7 @@ def _load(description: dict[str, Any], path: str | Path) -> Any:
 
     try:
         # When Mitsuba computes normals, it fails without triangles, and writes out of bounds for wrong vertex indices.
-        # So the faces are checked first, on a mesh with `face_normals`, for which Mitsuba computes no normals.
+        # Therefore, the faces are checked first, on a mesh with `face_normals`, for which Mitsuba computes no normals.
         _check_faces(mi.load_dict(description | {"face_normals": True}), path)
         return mi.load_dict(description)
     except RuntimeError as error:
@@ -95,7 +95,7 @@ def _check_faces(mesh: Any, path: str | Path) -> None:
         first = int(np.argmax(beyond))
         raise MeshError(
             f"mesh {path}: triangle {first // 3} refers to vertex {corners[first]}, "
-            f"but the mesh has {mesh.vertex_count()} vertices, counted from 0; export it again"
+            f"but the mesh has {mesh.vertex_count()} vertices, counted from 0; export the mesh again"
         )
 
 
@@ -110,7 +110,7 @@ def _points(mesh: Any, path: str | Path) -> NDArray[np.float64]:
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             raise MeshError(
-                f"mesh {path}: {name} of vertex {np.argmax(bad)} are NaN or infinite; export it again"
+                f"mesh {path}: {name} of vertex {np.argmax(bad)} are NaN or infinite; export the mesh again"
             )
     faces = np.array(params["faces"], dtype=np.int64)
     return np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)[faces]

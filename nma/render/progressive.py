@@ -76,7 +76,7 @@ def pass_sizes(spp: int, pixels: int) -> list[int]:
     """The samples per pixel of each pass. All passes have the same number of samples, except that the last pass may
     have fewer.
 
-    Where possible, these numbers fill the grid of the multi-jittered sampler.
+    Where possible, these sample counts fill the grid of the multi-jittered sampler.
     """
     most = max(SAMPLES_PER_PASS // pixels, 1)
     equal = -(-spp // -(-spp // most))
@@ -91,12 +91,12 @@ def sampler(spp: int, pixels: int) -> str:
 
 
 def _fills_grid(samples: int) -> bool:
-    """Whether Mitsuba's multi-jittered sampler takes exactly this number of samples. The sampler rounds other numbers
-    up."""
+    """Whether Mitsuba's multi-jittered sampler draws exactly this number of samples. The sampler rounds other sample
+    counts up."""
     return samples % max(math.isqrt(samples), 1) == 0
 
 
 def _pass_seed(seed: int, number: int) -> int:
-    """The seed of pass `number`. This seed is a hash, because with seed + number, pass 1 of one seed would repeat pass
-    0 of the next seed."""
+    """The seed of pass `number`. The seed is a hash of `seed` and `number`. With the sum `seed + number`, pass 1 of one
+    seed would repeat pass 0 of the next seed."""
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])

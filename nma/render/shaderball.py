@@ -1,4 +1,5 @@
-"""A shader ball made by code: an open shell with a groove, a small ball inside it, and the ring it stands on.
+"""A shader ball made by code: an open shell with a groove, a small ball inside the shell, and the ring on which the
+shell stands.
 
 Every part is a solid of revolution. Texture coordinate u runs around the axis, and v runs along the profile. At a pole
 all values of u meet in one point, so the axes are chosen such that no pole faces the default camera.
@@ -153,7 +154,7 @@ def _shell_profile() -> Array:
     rim = np.arctan2(middle[0], middle[1] - CAVITY_OFFSET)
     inside = _arc(radius, np.pi, rim) + np.array([0.0, CAVITY_OFFSET])
 
-    # The angles of the lip's arc around its centre go from the direction of the cavity's centre to the outward
+    # The angles of the lip's arc around the lip's centre go from the direction of the cavity's centre to the outward
     # direction of the shell.
     turn = np.linspace(rim - np.pi, SHELL_OPENING, 400)
     lip = middle + LIP_RADIUS * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
@@ -187,8 +188,8 @@ def _ring_profile() -> Array:
 
 
 def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
-    """Radius, height, outward normal (n, 2) and arc length at steps + 1 points, which lie closer where the profile
-    turns."""
+    """Radius, height, outward normal (n, 2) and arc length at steps + 1 points, which lie closer together where the
+    profile turns."""
     delta = np.diff(profile, axis=0)
     piece = np.linalg.norm(delta, axis=1)
     delta, start, piece = delta[piece > 1e-9], profile[:-1][piece > 1e-9], piece[piece > 1e-9]
@@ -209,7 +210,8 @@ def _resample(profile: Array, steps: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _grid_faces(rows: int, columns: int, radius: Array) -> NDArray[np.int32]:
-    """Two triangles (m, 3) for each cell of a grid of vertices, without the triangles at a pole that have no area."""
+    """Two triangles (m, 3) for each cell of a grid of vertices, except for the triangles at a pole that have no
+    area."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     lower, upper = np.stack([a, d, c], -1), np.stack([a, c, b], -1)

@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 class Measurement(NamedTuple):
     """The result of several runs of one rendering, each with its own seed.
 
-    `mean`: (height, width, 3) float64. `variance`: an array of the same shape, the unbiased variance of ONE run of
-    `spp` samples, not of the mean. `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`: median wall
-    time of a run. `compile_seconds`: how much longer the warm-up took than a run; 0 without warm-up. `times`: seconds
-    of each run.
+    `mean`: (height, width, 3) float64. `variance`: an array of the same shape, the unbiased estimate of the variance of
+    ONE run of `spp` samples, not of the mean. `runs`: number of seeds. `spp`: samples per pixel of a run. `seconds`:
+    median wall time of a run. `compile_seconds`: how much longer the warm-up took than a run; 0 without warm-up.
+    `times`: seconds of each run.
     """
 
     mean: Array
@@ -47,9 +47,9 @@ class Measurement(NamedTuple):
 class Agreement(NamedTuple):
     """The result of `zscore_images`.
 
-    `p_values`: the two-sided p-value of each block of pixels, (rows, columns, channels). `level`: the level of each
-    single test, after Sidak's correction. `passed`: whether no p-value is below `level`. `worst`: (row, column,
-    channel) of the smallest p-value.
+    `p_values`: the two-sided p-value of each block of pixels, (rows, columns, channels). `level`: the significance
+    level of each single test, after Sidak's correction. `passed`: whether no p-value is below `level`. `worst`: the
+    index (row, column, channel) of the smallest p-value.
     """
 
     p_values: Array
@@ -83,7 +83,7 @@ def measure(
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if len(numbers) < 2 or len(set(numbers)) < len(numbers):
         raise ParamError(
-            f"measure: pass at least two seeds, all different, or how many seeds to take; got {numbers}"
+            f"measure: pass at least two seeds, all different, or the number of seeds; got {numbers}"
         )
     first = 0.0
     if warmup:
@@ -135,10 +135,10 @@ def zscore_images(
 
     This is Welch's t-test, a Z-test with estimated variances (Jung, Hanika and Dachsbacher 2020). The degrees of
     freedom come from the equation of Welch and Satterthwaite; with many runs the t-distribution approaches the normal
-    distribution. Each single test has Sidak's level, 1 - (1 - false_alarm)^(1/tests), so that equal images fail in any
-    of the tests with a probability of about `false_alarm`. Where few paths reach the light, runs of few samples are far
-    from normally distributed, and equal images fail too often. For scenes with few such paths, use few long runs
-    instead of many short runs.
+    distribution. Each single test has Sidak's significance level, 1 - (1 - false_alarm)^(1/tests), so that equal images
+    fail in any of the tests with a probability of about `false_alarm`. Where few paths reach the light, runs of few
+    samples are far from normally distributed, and equal images fail too often. For scenes with few such paths, use few
+    long runs instead of many short runs.
 
     This function needs scipy, which comes with the extras `compare` and `train`.
 
@@ -169,8 +169,8 @@ def zscore_images(
         )
     a, var_a, b, var_b = (_blocks(array, block) for array in arrays)
 
-    # The squared standard errors of the differences of block means, and their degrees of freedom (Welch and
-    # Satterthwaite).
+    # The squared standard errors of the differences between block means, and the degrees of freedom of these errors
+    # (Welch and Satterthwaite).
     pixels = block**2
     error = var_a / (runs_a * pixels) + var_b / (runs_b * pixels)
     spread = sum(

@@ -47,11 +47,11 @@ def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope:
     """Smooth noise that tiles: (size, size), mean 0, standard deviation 1.
 
     White noise is filtered in the frequency domain: the amplitude is constant up to the frequency 1/period, and then
-    falls with frequency^-slope. The noise tiles because all frequencies are whole cycles per tile. Equal seeds give the
-    same pattern at every size.
+    falls with frequency^-slope. The noise tiles because all frequencies are whole numbers of cycles per tile. Equal
+    seeds give the same pattern at every size.
 
     Args:
-        period: size of the largest features, as a share of the texture.
+        period: size of the largest features, as a fraction of the texture's width.
         slope: 1.5 gives rough noise, 3 gives smooth noise.
     """
     frequency = np.fft.fftfreq(size, 1.0 / size)
@@ -63,8 +63,8 @@ def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope:
 
 
 def _low_frequencies(rng: np.random.Generator, size: int, cutoff: int = 64) -> NDArray[np.complex128]:
-    """A spectrum (size, size) of white noise up to `cutoff` cycles per tile. The value at each frequency is the same
-    for every size."""
+    """A spectrum (size, size) of white noise up to `cutoff` cycles per tile. The value at each frequency does not
+    depend on `size`."""
     block = rng.normal(size=(2, 2 * cutoff + 1, 2 * cutoff + 1))
     reach = min(cutoff, size // 2 - 1)
     inner = block[:, cutoff - reach : cutoff + reach + 1, cutoff - reach : cutoff + reach + 1]

@@ -1,8 +1,8 @@
 """Mitsuba 3 BSDF `values`: renders a source whose BRDF values are known, such as a measurement, without an adapter.
 
-The property `file` names any file that `nma.sources.read` reads, and `material` chooses a material of a file with
-several materials. In place of `file`, `source` may be the index of a source in memory, which `bsdf_of` sets. The BSDF
-may be anisotropic, is one-sided, and is the same everywhere on a surface.
+The property `file` names any file that `nma.sources.read` reads, and the property `material` chooses a material of a
+file with several materials. Instead of `file`, the property `source` may be the index of a source in memory; `bsdf_of`
+sets this property. The BSDF may be anisotropic, is one-sided, and is the same everywhere on a surface.
 
 For all materials, directions are drawn from the same mixture of a cosine lobe and three microfacet lobes. This sampling
 is unbiased but noisy, so the BSDF suits reference pictures with many samples.

@@ -96,7 +96,8 @@ private:
         p.low = -1e30, p.high = 1e30;
         const Inputs given(props, {p}, false);
         if (given.textured())
-            Throw("the adapter was trained for a single material, so %s cannot be textured; leave it out", p.name);
+            Throw("the adapter was trained for a single material, so %s cannot be textured; leave %s out", p.name,
+                  p.name);
         float numbers[MOST_PARAMETERS];
         given.at(dr::zeros<SurfaceInteraction3f>(), numbers);
         for (int c = 0; c < p.size; ++c)
