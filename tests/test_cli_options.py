@@ -155,4 +155,4 @@ def test_an_interrupted_command_says_how_to_continue(nma, monkeypatch):
     monkeypatch.setattr(materials, "names", interrupted)
     code, out, err = nma("materials")
     assert (code, out) == (130, "")
-    assert err == "nma: interrupted; run the same command again to go on from what it has kept\n"
+    assert err == "nma: interrupted; run the same command again to continue from its stored results\n"

@@ -4,7 +4,7 @@
 
 A room is a module or a package directly in `nma/`. The floors of the rooms are read from the contract in
 pyproject.toml, and the imports are read from the code. A thin arrow from room A to room B means that A imports B. The
-arrow from A to B is omitted if A also imports B indirectly, through other rooms.
+arrow from A to B is omitted if A also imports B through other rooms.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ OUTSIDE = ("runtime/", "The adapter in C++, for any renderer", "render")
 
 
 class Step(NamedTuple):
-    """One step of the data: the room that passes the data on, the room that receives it, and the kind of data."""
+    """One step of the data: the room that returns the data, the room that receives the data, and the kind of data."""
 
     start: str
     end: str
@@ -36,13 +36,13 @@ class Step(NamedTuple):
 
 WAY = (
     Step("params", "sources", "the parameters of a class"),
-    Step("sources", "table", "walks through a material, or its known values"),
+    Step("sources", "table", "random walks through a material, or BRDF values"),
     Step("table", "train", "tables: binned values, with their noise"),
-    Step("train", "adapter", "weights, a file that says all that is needed to use them"),
+    Step("train", "adapter", "a weights file, with everything that a renderer needs"),
     Step("adapter", "render", "the blend at a point, for Mitsuba"),
     Step("adapter", OUTSIDE[0], "the same weights, for C++"),
     Step("target", "export", "the analytic BRDF, as syntax trees"),
-    Step("export", OUTSIDE[0], "the same, printed as C++"),
+    Step("export", OUTSIDE[0], "the analytic BRDF, printed as C++"),
 )
 
 BOX, HEIGHT, GAP, RISE, PASSAGE, PORT = 210, 94, 14, 58, 16, 13  # px
@@ -119,7 +119,7 @@ def plan() -> Plan:
 
 
 def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
-    """Exits with a message if an import cannot be drawn, or if the two rooms of a step do not import each other."""
+    """Exits with a message if an import cannot be drawn, or if neither of the two rooms of a step imports the other."""
     if unknown := {room for arrow in imports for room in arrow if room not in level}:
         sys.exit(
             f"{', '.join(sorted(unknown))}: not on any floor; add the room to the contract in pyproject.toml"
@@ -129,7 +129,7 @@ def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
     for step in WAY:
         ends = {(step.start, step.end), (step.end, step.start)}
         if step.end != OUTSIDE[0] and not ends & imports:
-            sys.exit(f"{step.start} and {step.end} do not import each other; correct WAY in tools/map.py")
+            sys.exit(f"neither of {step.start} and {step.end} imports the other; correct WAY in tools/map.py")
 
 
 def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], float]:
@@ -221,8 +221,8 @@ def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
 def _points(p: Plan, arrow: Arrow) -> list[tuple[int, int]]:
     """The points of an arrow from top to bottom.
 
-    The first point is at the upper box and the last point at the lower box. For every floor that the arrow passes,
-    there is one point where it enters and one point where it leaves this floor.
+    The first point is at the upper box and the last point at the lower box. Every floor that the arrow passes has two
+    points: where the arrow enters the floor, and where the arrow leaves the floor.
     """
     upper, lower = arrow
     level = p.level(upper)
@@ -247,7 +247,7 @@ def _legend(p: Plan) -> list[str]:
     """Draws the legend: the meaning of the two kinds of arrows, and the list of the steps of the data."""
     left, top = MARGIN + 12, _top(len(p.floors)) + 4
     told = (
-        "The upper room imports the lower room. An import is not drawn if it also exists through other rooms."
+        "The upper room imports the lower room. An import that also exists through other rooms is not drawn."
     )
     parts = [
         f'<path class="import" d="M{left} {top - 4}h34"/>',

@@ -2,7 +2,7 @@
 
 A room is a module or a package directly in `nma/`. The floor of each room is read from pyproject.toml, where the
 contract that `make lint` checks lists the floors. The imports of each room are read from the code. Imports inside
-functions count, and imports that only type checkers execute count, too.
+functions, and imports that only type checkers execute, count too.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def circle(arrows: frozenset[Arrow]) -> list[str]:
 def summary(room: str, fits: Callable[[str], bool] = lambda text: True) -> str:
     """A short description of a room: the longest beginning of its docstring's first sentence for which `fits` is true.
 
-    The description ends before a colon, a semicolon or a parenthesis. If no such beginning fits, the description ends
-    before a comma.
+    The description ends before a colon, a semicolon or a parenthesis or, if no beginning of this kind fits, before a
+    comma.
     """
     place = ROOT / PACKAGE / room
     file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")

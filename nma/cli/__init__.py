@@ -1,8 +1,8 @@
 """The command line `nma`: parses arguments, calls the other modules of the package, and prints results.
 
 Each command is implemented in a file of the same name. Commands that share a first word, such as `nma library list` and
-`nma library encode`, are implemented in one file. To add a command, write a file with a function `register`, and add
-the file's name to `COMMANDS`.
+`nma library encode`, share one file. To add a command, write a file with a function `register`, and add the file's name
+to `COMMANDS`.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def _options(
 
 def main() -> None:
     """The entry point of the program `nma`. Expected errors are printed as one line on stderr, with exit status 1."""
-    # Without a handler, SIGTERM ends the process at once, and files that are being written stay behind.
+    # Without a handler, SIGTERM would end the process at once, and leave incomplete files.
     signal.signal(signal.SIGTERM, lambda number, frame: _interrupted(128 + number))
     try:
         try:
@@ -119,7 +119,7 @@ def _fail(message: str) -> NoReturn:
 def _interrupted(status: int = 130) -> NoReturn:
     """Ends the command after Ctrl-C or SIGTERM. The exit status is 128 plus the number of the signal."""
     print(
-        "nma: interrupted; run the same command again to go on from what it has kept",
+        "nma: interrupted; run the same command again to continue from its stored results",
         file=sys.stderr,
     )
     sys.exit(status)

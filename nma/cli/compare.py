@@ -25,10 +25,10 @@ def compare(
     test: Annotated[
         str,
         typer.Argument(
-            help="An image (EXR, PNG, ...) to judge. Or, alone, a material or the adapter of one."
+            help="An image (EXR, PNG, ...); or, without REFERENCE, a material or the adapter of a single material."
         ),
     ],
-    reference: Annotated[str | None, typer.Argument(help="The image to judge it by.")] = None,
+    reference: Annotated[str | None, typer.Argument(help="The reference image.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print nothing but JSON on stdout.")] = False,
     output: Annotated[
         Path | None, options.output("A PNG to write, with both images and the map of their FLIP.", ".png")

@@ -21,7 +21,7 @@ __all__ = ["TrainingBar", "counting", "err", "loss_plot", "number", "out", "prog
 out = Console()
 
 _GAP = 2
-# Cells with more characters than this limit are sentences, which may be wrapped between words.
+# A cell with more characters than this is treated as a sentence, which may be wrapped between words.
 _SENTENCE = 24
 
 
@@ -56,9 +56,8 @@ def counting(
 ) -> Iterator[Callable[..., Any]]:
     """Shows a progress bar that counts from `before` to `total`, with a rate in `unit`.
 
-    Yields a function that updates the bar. The arguments of this function are the count so far and the work done since
-    the start, and optionally a new `note` or `description` of the bar. The function returns the rate, which is the work
-    per second.
+    Yields a function `show(done, work, **more)`, which updates the bar and returns the work per second. `done` is the
+    count so far, `work` is the work since the start, and `more` may set the `note` and the `description` of the bar.
     """
     with progress(unit) as bar:
         task = bar.add_task(title, total=total, completed=before, rate="", note="")

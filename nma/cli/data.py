@@ -41,7 +41,7 @@ def listing(context: typer.Context) -> None:
 
 @data.command()
 def check(path: Annotated[Path, typer.Argument(help="A file, or a folder with files.")]) -> None:
-    """Check files of measurements: their size, structure, values and, if it is known, checksum.
+    """Check files of measurements: the size, the structure, the values and, where it is known, the checksum.
 
     The exit status is 1 if any file has a fault.
     """
@@ -71,7 +71,7 @@ def merl(
     adapter: Annotated[
         str,
         typer.Option(
-            help="What evaluates named materials and material files: a shipped adapter's name or a weights file."
+            help="The adapter of named materials and material files: a shipped adapter's name or a weights file."
         ),
     ] = "layered3-5x64",
     clamp: options.Clamp = False,

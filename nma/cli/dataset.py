@@ -27,7 +27,7 @@ def dataset(
 ) -> None:
     """Simulate tables of many random materials of a class, as a dataset for training.
 
-    If a run is killed, the same command continues the run. Several runs may write to one dataset at the same time.
+    The same command continues a killed run. Several runs may write to one dataset at the same time.
     """
     from nma.table.dataset import Dataset, Settings
 

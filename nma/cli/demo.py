@@ -28,9 +28,9 @@ def demo(
 ) -> None:
     """Render two layered materials with the reference and with the adapter, and measure time, variance and error.
 
-    The first material has no textures, and the second material has three textures. The command writes a sheet of
-    pictures as soon as the first pictures are rendered, and writes the sheet again when it has measured more results.
-    The command prints the time, variance and error as a table. `nma demo` takes about a minute on two CPU cores.
+    The first material has no textures, and the second material has three textures. `nma demo` writes a sheet of
+    pictures as soon as they are rendered, writes the sheet again with the measured results, and prints the results as a
+    table. `nma demo` takes about a minute on two CPU cores.
     """
     from nma.images import metrics
 

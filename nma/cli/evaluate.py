@@ -24,8 +24,8 @@ def evaluate(
 ) -> None:
     """Compare an adapter with reference tables, bin by bin, and print the errors of each material and their means.
 
-    The averages of the adapter over the bins are computed by numerical integration. The line below the printed table
-    gives the error of this integration. The page docs/evaluation.md defines the printed errors.
+    The adapter is averaged over each bin by numerical integration, whose error is printed below the table. The page
+    docs/evaluation.md defines the printed errors.
     """
     from nma.adapter import Adapter
     from nma.evaluate import evaluate as run

@@ -10,8 +10,8 @@ import typer
 from nma.cli import console
 
 _ABOUT_THE_LOSS = (
-    "The log loss of training is measured against noisy tables, so that it holds their noise too. "
-    "`nma evaluate` says how far an adapter is from a reference, and how much noise the reference has."
+    "The log loss of the training includes the noise of the training tables. "
+    "`nma evaluate` prints the error of an adapter against a reference, and the noise of the reference."
 )
 
 

@@ -42,7 +42,7 @@ def train_library(
 ) -> None:
     """Train a library: one small network for many materials, and a code for each material (paper Fig. 12).
 
-    If a run is killed, the same command continues from the tables in OUTPUT.tables and the checkpoint OUTPUT.ckpt.
+    The same command continues a killed run from the tables in OUTPUT.tables and the checkpoint OUTPUT.ckpt.
 
     Example: [bold]nma train-library ~/merl -o library.safetensors[/bold]
     """
@@ -94,12 +94,12 @@ def encode(
     material: Annotated[str | None, typer.Option(help="Which material, if the file holds several.")] = None,
     name: Annotated[
         str | None,
-        typer.Option(help="What to call the new material: its own name or the file's, unless given."),
+        typer.Option(help="The name of the new material; by default --material, or the name of the file."),
     ] = None,
     steps: options.Steps = None,
     seed: Annotated[int, options.seed("Seed of the batches.")] = 0,
 ) -> None:
-    """Find the code of a new material, and write a library that also contains this code. The network stays the same.
+    """Find the code of a new material for the unchanged network, and write a library that also contains this code.
 
     Example: [bold]nma library encode library.safetensors paper_white_rgb.bsdf -o more.safetensors[/bold]
     """

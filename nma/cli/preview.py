@@ -35,7 +35,7 @@ class View(NamedTuple):
     mesh_up: str = "z"
 
     def load(self, material: Material, model: str, adapter: str = "", clamp: bool = False) -> Any:
-        """Loads the preview scene with this material."""
+        """Loads the preview scene with `material`."""
         from nma.render import load, progressive, scene
 
         use_rgb(self.variant)
@@ -62,7 +62,7 @@ def subject(
 ) -> tuple[Material, str]:
     """The material that the user named, and the adapter that renders it.
 
-    The user may also name a weights file of an adapter for a single material, which then gives the material and the
+    If the user named the weights file of an adapter for a single material, this file gives both the material and the
     adapter. Options that would have no effect are rejected as wrong usage.
     """
     refuse(context, ("define",), "a material")
@@ -88,8 +88,8 @@ def render(scene: Any, spp: int, seed: int, title: str, integrator: Any = None) 
 def samples_bar(title: str, total: int) -> Iterator[Callable[[str, int], None]]:
     """Shows a progress bar that counts samples per pixel.
 
-    Yields a function that updates the bar. The arguments of this function are a description of the current step, and
-    the number of samples per pixel that were rendered since the last call.
+    Yields a function `advance(what, samples)`, which updates the bar. `what` describes the current step, and `samples`
+    is the number of samples per pixel that were rendered since the last call.
     """
     done = 0
     with console.counting(title, total, "spp/s") as show:

@@ -39,9 +39,9 @@ def _json(fitted: Principled) -> str:
     return principled_json(fitted)
 
 
-# The text formats, by the ending of a file's name. If two endings fit a name, the longer ending is used. A renderer
-# whose files are also JSON therefore needs a longer ending, such as `.blend.json`. The functions of the formats import
-# their modules only when they are called, so that `nma --help` is quick.
+# The text formats, by the ending of a file's name. If two endings fit a name, the longer ending is used, so another
+# renderer whose files are JSON can have an ending such as `.blend.json`. The functions of the formats import their
+# modules only when they are called, so that `nma --help` is quick.
 _TEXTS = {".xml": Text("Mitsuba", _xml), ".json": Text("Mitsuba", _json)}
 
 
@@ -77,7 +77,7 @@ def principled(
 ) -> None:
     """Fit one Principled BRDF with constant parameters to a material, and print its parameters for Mitsuba.
 
-    The fit uses no network and no blend, and the parameters do not depend on the direction, so that any renderer with a
+    The fit uses no network and no blend, and the parameters do not depend on the direction, so any renderer with a
     Principled BRDF can use the fitted parameters.
 
     Examples: [bold]nma principled gold-red-lacquer -o gold.xml[/bold],

@@ -46,7 +46,7 @@ def material_of(name: str, changes: list[str] | None) -> Material:
 def known_of(
     source: str, material: str | None = None, walks: int = 16_000_000, seed: int = 0
 ) -> tuple[Values | Tables, dict[str, Any]]:
-    """The table or the BRDF values of one material, and a record of where they come from.
+    """The table or the BRDF values of one material, and a record of their origin.
 
     A named material or a material file (.toml) is simulated with `walks` random walks, which gives a table. A reference
     file (.npz) contains a table. Any other file that `nma.sources.read` can read gives BRDF values. If a file has
@@ -78,7 +78,9 @@ def tables_of(
     if isinstance(known, Tables):
         return known, record
     if not known.isotropic:
-        raise SourceError(f"{source}: {known.name} is anisotropic, only isotropic materials can be fitted")
+        raise SourceError(
+            f"{source}: {known.name} is anisotropic, but only isotropic materials can be fitted"
+        )
     began = time.perf_counter()
     tables = tabulate_values(known, points=POINTS)
     console.say(f"tabulated {known.name} in {time.perf_counter() - began:.1f} s")
@@ -92,7 +94,7 @@ def values_of(source: str, material: str | None, adapter: str, clamp: bool = Fal
     material or a material file (.toml). The BRDF of a named material or a material file is computed by the adapter
     `adapter`. `clamp` moves the material's parameters into the training range of this adapter.
 
-    Raises `NmaError` if a file cannot be read, and if `source` is a reference file, because a table has only means over
+    Raises `NmaError` if a file cannot be read, or if `source` is a reference file, whose tables contain only means over
     bins.
     """
     from nma import materials
@@ -158,8 +160,8 @@ def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]
     tables = Tables.load(path)
     if tables.class_name not in sources.classes():
         raise TableError(
-            f"{path}: its materials are of class '{tables.class_name}'; this version has "
-            f"{', '.join(sources.classes())}: use the version that wrote it"
+            f"{path}: its materials are of class '{tables.class_name}', but this version has only "
+            f"{', '.join(sources.classes())}; use the version that wrote the file"
         )
     number = _number(path, len(tables.values), material)
     chosen = tables[number : number + 1]

@@ -52,7 +52,7 @@ def train(
 ) -> None:
     """Train an adapter for a whole class of materials.
 
-    If a run is killed, the same command continues from the checkpoint OUTPUT.ckpt.
+    The same command continues a killed run from the checkpoint OUTPUT.ckpt.
 
     Example: [bold]nma dataset layered3 l3.zarr && nma train layered3 --data l3.zarr -o my.safetensors[/bold]
     """

@@ -7,12 +7,13 @@ from typing import Any
 
 from nma.cli import console, options
 
-# The printed loss is the mean over this many of the last steps.
+# The number of last steps over which the printed loss is averaged.
 _LAST = 500
 
 
 def of_variant(variant: str, target: str | None, instances: int | None = None) -> dict[str, Any]:
-    """The fields of a recipe that the option --variant sets. `target` and `instances`, if given, override it."""
+    """The fields of a recipe that the option --variant sets. `target` and `instances`, if given, override these
+    fields."""
     count, directional = options.VARIANTS[variant]
     if not directional:
         # If the parameters do not depend on the view direction, lobes cannot be stretched along the plane of incidence.
@@ -31,7 +32,7 @@ def finish(adapter: Any, run: Any, output: Path) -> None:
 
 
 def losses(run: Any, output: Path) -> tuple[float, Path]:
-    """The mean log loss of the last steps, and the path of the plot of the loss, which this function writes."""
+    """Writes the plot of the loss, and returns the mean log loss of the last steps and the path of the plot."""
     from nma.train.plot import plot_losses
 
     last = run.log_losses[-_LAST:]
