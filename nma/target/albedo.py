@@ -1,5 +1,5 @@
-"""Upper bounds of the directional albedo of each lobe of a Principled BRDF. The bounds have two uses: a lobe is sampled
-with a probability in proportion to its bound, and `bounded` keeps a blend from reflecting more light than it receives.
+"""Upper bounds of the directional albedo of each lobe of a Principled BRDF. A lobe is sampled with a probability in
+proportion to its bound. `bounded` uses the bounds to keep a blend from reflecting more light than it receives.
 
 The Principled BRDF does not conserve energy. The diffuse lobe is not reduced where the specular lobe and the clearcoat
 reflect light. The retro-reflection of the diffuse lobe alone reaches 1.5 at grazing angles. For saturated colours,
@@ -26,12 +26,12 @@ from nma.target.principled import (
 # This value is added to the bounds of the diffuse and the specular lobe, so that both lobes are sampled even where they
 # reflect nothing.
 MIN_ALBEDO = 1e-4
-# The fitted formulas in the bounds are too low by at most these amounts, which are added to the formulas.
+# The fitted formulas are too low by at most these margins. To get upper bounds, the margins are added to the formulas.
 SPEC_MARGIN = 0.009
 CLEARCOAT_MARGIN = 0.005
 SHEEN_MARGIN = 0.0005
-# Cosine-weighted means over the hemisphere of wo: of the Schlick weight of wo, and of this weight times cos(theta_o)
-# and times cos^2(theta_o).
+# Cosine-weighted means over the hemisphere of wo: _W0 is the mean of the Schlick weight of wo, _W1 that of the weight
+# times cos(theta_o), and _W2 that of the weight times cos^2(theta_o).
 _W0, _W1, _W2 = 1.0 / 21.0, 1.0 / 84.0, 1.0 / 252.0
 
 
@@ -60,9 +60,8 @@ def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:
     the sheen."""
     r = p.roughness
     lambert = (1.0 - 0.5 * weight) * (1.0 - 0.5 * _W0)
-    # The factor `retro` of `diffuse_terms` is r (1 + wi . wo). The next variables are cosine-weighted means over wo:
-    # `retro` of this factor, `retro_w` of this factor times the Schlick weight of wo, and `retro2_w` of the squared
-    # factor times that weight.
+    # In `diffuse_terms`, the factor of retro-reflection is F = r (1 + wi . wo). With the Schlick weight w of wo, the
+    # cosine-weighted means over wo are `retro` of F, `retro_w` of F w, and `retro2_w` of F^2 w.
     retro = r * (1.0 + (2.0 / 3.0) * cos)
     retro_w = r * (_W0 + cos * _W1)
     sin2 = 1.0 - cos * cos
@@ -81,7 +80,7 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
     The typical facet is tilted towards the viewer, as the visible facets of rough surfaces are at grazing angles.
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    alpha = ops.minimum(alpha_x, alpha_y)  # the smaller width, along whose axis facets tilt less
+    alpha = ops.minimum(alpha_x, alpha_y)  # the smaller width: facets tilt less along its axis
     tilt = 0.62 * alpha / (alpha + 0.35)
     facet2 = ops.minimum(cos * cos + tilt * tilt, 1.0)
     facet = ops.sqrt(facet2)
@@ -93,9 +92,9 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
 def clearcoat_albedo(p: Principled, cos: Float, weight: Float) -> Float:
     """The bound of the clearcoat, which is treated as a mirror.
 
-    The bound goes to 0 at grazing angles, because the formula of the clearcoat has no factor 1 / (4 cos_i cos_o).
+    The bound minus its margin goes to 0 at grazing angles, because the clearcoat has no factor 1 / (4 cos_i cos_o).
     """
-    # The formula of `masking_denominator`, with sin^2(theta_i) computed from the cosine.
+    # The masking G1 is that of `masking_denominator`, with sin^2(theta_i) computed from the cosine.
     cos2 = cos * cos
     alpha2 = CLEARCOAT_MASKING_ALPHA * CLEARCOAT_MASKING_ALPHA
     masking = 2.0 * cos / (cos + ops.sqrt(cos2 + alpha2 * (1.0 - cos2)))

@@ -18,7 +18,8 @@ from nma.target.blend import Blend
 from nma.target.principled import MIN_ALPHA, Principled
 
 Scale = Literal["linear", "log"]
-# `encode` keeps values this fraction of a range away from the ends of the range, which no finite output reaches.
+# `encode` keeps values this fraction of a range away from the ends of the range, because no finite raw output decodes
+# to an end.
 ENCODE_MARGIN = 1e-6
 
 
@@ -26,9 +27,9 @@ ENCODE_MARGIN = 1e-6
 class TargetParam:
     """A field of `Principled` that the network sets: its size, and the range to which raw outputs are decoded.
 
-    Only the field `anisotropic` may be `in_plane`, for isotropic classes. The x axis of the lobes then lies in the
-    plane of incidence (`nma.target.plane`), and the field is multiplied by sin^2(theta_i), because the plane of
-    incidence is not defined at normal incidence.
+    For isotropic classes, the field `anisotropic` may be `in_plane`; no other field may. The x axis of the lobes then
+    lies in the plane of incidence (`nma.target.plane`), and the field is multiplied by sin^2(theta_i), because the
+    plane of incidence is not defined at normal incidence.
     """
 
     name: str
@@ -86,7 +87,7 @@ MEASURED_PARAMS = (
 # along the plane of incidence.
 ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
-# Ranges on which fields of the Principled BRDF are defined; all other fields have 0 .. 1.
+# Ranges on which fields of the Principled BRDF are defined; all other fields have the range 0 .. 1.
 _LIMITS = {
     "specular": (0.0, 12.0),  # 12.5 gives a reflectance of 1, which no index of refraction has
     "anisotropic": (-1e6, 1.0),
@@ -202,8 +203,8 @@ def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> l
 def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
     """The blend as a flat list: all parameters, then all weights except the last.
 
-    Curves over cos(theta_i) interpolate these flat lists, because every convex combination of flat lists describes a
-    valid blend.
+    Curves over cos(theta_i) can interpolate these flat lists, because every convex combination of flat lists describes
+    a valid blend.
     """
     flat: list[Float] = []
     for p in blend.instances:

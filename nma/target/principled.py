@@ -7,16 +7,17 @@ the light. Values are f cos(theta_o).
 Deliberate differences from Mitsuba's plugin, all of them small:
 - Narrow peaks are more precise. GGX and GTR1 are computed from the components of the half vector, never from 1 +
   (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is wrong by several per cent at alpha .001.
-- `specular` may vary over the surface, and 0 means no dielectric reflection. In Mitsuba, `specular` = 0 also removes
-  the reflection of metals.
+- `specular` may vary over the surface, and `specular` = 0 removes only the dielectric reflection. In Mitsuba,
+  `specular` = 0 also removes the reflection of metals.
 - The cosine between a direction and the half vector is computed as |wi + wo| / 2, the same for both directions. Mitsuba
   computes the dot product of `wi` and the half vector, whose rounding error is large where both directions are grazing
   and nearly opposite.
 - Tints divide by max(luminance, 1e-6). For colours darker than 1e-6 the tints fade to black. In Mitsuba, the tint of
   black is white.
 - An instance may fade out towards grazing half vectors (`fade`), where measurements end. Mitsuba's BRDF has no fade.
-- Directions below the horizon (there is no back side), and directions within 1e-9 of it, are invalid.
-- Lobes are sampled in proportion to their estimated albedo, with one density for the whole blend (`nma.target.blend`).
+- Directions below the horizon are invalid, because there is no back side. Directions whose cosine is at most 1e-9 are
+  invalid, too.
+- Lobes are sampled in proportion to a bound of their albedo, with one density for the whole blend (`nma.target.blend`).
 
 The functions here use only straight-line arithmetic and `select`, so that `nma.export` can print them as C++.
 """
@@ -31,7 +32,7 @@ from nma.ops import Color, Float, Mask, Vec3
 
 DIALECT = "mitsuba-principled-reflection"
 MIN_ALPHA = 0.001  # the smallest microfacet width, as in Mitsuba
-MIN_COS = 1e-9  # directions closer to the horizon are invalid
+MIN_COS = 1e-9  # directions with cosines up to this value are invalid
 CLEARCOAT_MASKING_ALPHA = 0.25  # Burley 2012, section 5.6
 CLEARCOAT_F0 = 0.04
 
@@ -61,7 +62,7 @@ class Principled(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Quantities of one pair of directions that all lobes of all instances share."""
+    """Quantities of one pair of directions that all lobes of all instances use."""
 
     valid: Mask  # whether both directions are above the horizon
     wi: Vec3
@@ -71,7 +72,7 @@ class Geometry(NamedTuple):
     weight_i: Float  # Schlick weights of wi.z, wo.z and cos_d
     weight_o: Float
     weight_d: Float
-    clearcoat: Float  # value of the clearcoat without its strength and distribution of normals
+    clearcoat: Float  # value of the clearcoat without the factors for strength and normal distribution
 
 
 class Terms(NamedTuple):
@@ -82,7 +83,7 @@ class Terms(NamedTuple):
 
 
 class Lobes(NamedTuple):
-    """The value of an instance [1/sr], and the density with which each of its lobes samples `wo` [1/sr]."""
+    """The value of an instance [1/sr], and the density with which each lobe of the instance samples `wo` [1/sr]."""
 
     value: Color
     diffuse_pdf: Float
@@ -105,7 +106,8 @@ def masking_denominator(v: Vec3, alpha_x: Float, alpha_y: Float) -> Float:
 
 
 def geometry(wi: Vec3, wo: Vec3) -> Geometry:
-    """The half vector, Schlick weights and the shared part of the clearcoat, for unit directions `wi` and `wo`."""
+    """The half vector, the Schlick weights and the part of the clearcoat that all instances share, for unit directions
+    `wi` and `wo`."""
     valid = (wi.z > MIN_COS) & (wo.z > MIN_COS)
     # In invalid pairs both cosines are set to 1, so that values and derivatives are always finite.
     i = Vec3(wi.x, wi.y, ops.select(valid, wi.z, 1.0))
@@ -186,7 +188,8 @@ def diffuse_terms(p: Principled, g: Geometry) -> Terms:
 
 
 def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms:
-    """The Fresnel reflectance of metal, tinted dielectric and plain dielectric together.
+    """The sum of the Fresnel reflectances of metal, tinted dielectric and plain dielectric, each multiplied by the
+    weight of its material.
 
     `cos2` is cos^2, which some callers have already computed, and `weight` is `schlick_weight(cos)`.
     """

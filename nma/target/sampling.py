@@ -20,8 +20,7 @@ def sample_spec(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) 
 
 
 def sample_clearcoat(wi: Vec3, alpha: Float, u1: Float, u2: Float) -> Vec3:
-    """The reflection of `wi` about a random normal, whose density is GTR1 times the cosine of the normal. Burley 2012,
-    appendix B."""
+    """The reflection of `wi` about a random normal h, whose density is GTR1 times h.z. Burley 2012, appendix B."""
     alpha2 = alpha * alpha
     phi = (2.0 * ops.PI) * u1
     sin2 = (ops.exp(ops.log(alpha2) * (1.0 - u2)) - alpha2) / (1.0 - alpha2)

@@ -40,7 +40,7 @@ struct Principled {
     T fade_width;
 };
 
-// Quantities of one pair of directions that all lobes of all instances share.
+// Quantities of one pair of directions that all lobes of all instances use.
 template <class T>
 struct Geometry {
     bool valid;
@@ -61,7 +61,7 @@ struct Terms {
     T white;
 };
 
-// The value of an instance [1/sr], and the density with which each of its lobes samples `wo` [1/sr].
+// The value of an instance [1/sr], and the density with which each lobe of the instance samples `wo` [1/sr].
 template <class T>
 struct Lobes {
     Vec3<T> value;
@@ -200,7 +200,8 @@ inline T masking_denominator(const Vec3<T>& v, T alpha_x, T alpha_y) {
     return v.z + sqrt(v.z * v.z + sx * sx + sy * sy);
 }
 
-// The half vector, Schlick weights and the shared part of the clearcoat, for unit directions `wi` and `wo`.
+// The half vector, the Schlick weights and the part of the clearcoat that all instances share, for unit directions `wi`
+// and `wo`.
 template <class T>
 inline Geometry<T> geometry(const Vec3<T>& wi, const Vec3<T>& wo) {
     const auto valid = wi.z > MIN_COS<T> && wo.z > MIN_COS<T>;
@@ -286,7 +287,8 @@ inline Terms<T> diffuse_terms(const Principled<T>& p, const Geometry<T>& g) {
     return Terms<T>{colored + tinted * luminance_inverse<T>(p.base_color), sheen - tinted};
 }
 
-// The Fresnel reflectance of metal, tinted dielectric and plain dielectric together.
+// The sum of the Fresnel reflectances of metal, tinted dielectric and plain dielectric, each multiplied by the weight
+// of its material.
 template <class T>
 inline Terms<T> spec_fresnel(const Principled<T>& p, T cos, T cos2, T weight) {
     const auto tinted = (T(1.0) - p.metallic) * p.spec_tint;
@@ -384,8 +386,7 @@ inline Vec3<T> sample_spec(const Vec3<T>& wi, T alpha_x, T alpha_y, T u1, T u2) 
     return reflect<T>(wi, sample_visible_normal<T>(wi, alpha_x, alpha_y, u1, u2));
 }
 
-// The reflection of `wi` about a random normal, whose density is GTR1 times the cosine of the normal. Burley 2012,
-// appendix B.
+// The reflection of `wi` about a random normal h, whose density is GTR1 times h.z. Burley 2012, appendix B.
 template <class T>
 inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
     const auto alpha2 = alpha * alpha;
