@@ -16,14 +16,17 @@ EPS = 1e-2
 
 
 def _normal_means(n: int) -> NDArray[np.float64]:
-    """The means (n,) of `n` equally likely intervals of the positive half of the standard normal distribution."""
+    """Splits the positive half of the standard normal distribution into `n` intervals of equal probability.
+
+    Returns the mean of the distribution in each interval: (n,).
+    """
     normal = NormalDist()
     densities = [normal.pdf(normal.inv_cdf(0.5 + 0.5 * k / n)) for k in range(n)] + [0.0]
     return -2.0 * n * np.diff(densities)
 
 
 # `noise_floor` takes the values in `_NORMAL` and their negatives as samples of a standard normal variable. The mean of
-# `_NORMAL` equals the mean magnitude of such a variable.
+# `_NORMAL` equals the mean absolute value of a standard normal variable.
 _NORMAL = _normal_means(16)
 
 FIGURES = ("log_loss", "ae", "smape", "mape", "mrse", "psnr", "albedo_error", "noise_floor")
@@ -39,7 +42,7 @@ def table_metrics(a: NDArray, b: NDArray, error: NDArray) -> dict[str, float]:
     - mrse: the mean of (a - b)^2 / (b^2 + EPS).
     - psnr: 10 log10(peak^2 / mean of (a - b)^2) dB, where peak is the reference's brightest bin.
     - albedo_error: the mean absolute difference of the directional albedos, over theta_i and RGB.
-    - noise_floor: the log loss that a perfect model would have, because the reference is noisy.
+    - noise_floor: the log loss that even a perfect model would have, because the reference is noisy.
     """
     a, b = a.astype(np.float64), b.astype(np.float64)
     difference = np.abs(a - b)
@@ -78,7 +81,7 @@ def noise_floor(b: NDArray, error: NDArray) -> float:
 
 
 def counting_error(b: NDArray, walks: int, solid_angle: float, rows: int) -> NDArray[np.float64]:
-    """An upper bound of each bin's standard error, from the number of walks: every throughput is assumed to be 1."""
+    """An upper bound of each bin's standard error, computed from the number of walks as if every throughput were 1."""
     return np.sqrt(np.maximum(b, 0.0).astype(np.float64) * rows / (walks * solid_angle))
 
 

@@ -1,8 +1,8 @@
 """Compares two sources at random pairs of directions.
 
 cos(theta_i) and cos(theta_o) are independent and uniform in the range `cosines`; azimuths are uniform. The comparison
-needs no bins, so the sources may be anisotropic, or models that were trained on different data. The error figures of
-adapters for single materials are computed at random pairs.
+needs no bins, so the sources may be anisotropic, and it does not matter on which data a model was trained. The error
+figures of adapters for single materials are computed in this way.
 """
 
 from __future__ import annotations

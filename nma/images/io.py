@@ -1,4 +1,7 @@
-"""Reads image files, and writes images as EXR (linear values) or PNG (for viewing), completely or not at all."""
+"""Reads image files, and writes images as EXR (linear values) or PNG (for viewing).
+
+A file is written completely or not at all.
+"""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from nma.images.io import ImageError, as_image, tonemap
 
 Image = NDArray[np.float32]
 EPS = 0.01
-SMALLEST = 11  # the least width and height in pixels: the width of ssim's window
+SMALLEST = 11  # smallest width and height in pixels, which is the width of ssim's window
 METRICS = ("l1", "l2", "mape", "smape", "mrse", "ssim", "flip_hdr", "flip_ldr")
 
 

@@ -30,7 +30,7 @@ TEXTURE_OPTIONS = ("texture", "raw", "channel", "scale", "offset", "uv_scale")
 # A material file is about a page of text, so a file with more bytes than this is rejected.
 MAX_BYTES = 1 << 20
 
-_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # finds .05, which TOML does not accept as a number
+_BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # finds numbers such as .05, which TOML rejects
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 
@@ -39,7 +39,8 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
 class Material:
     """A material of a class: `values` has a number, an RGB triple or a `Texture` for each parameter of the class.
 
-    A texture that `changed` adds repeats `uv_scale` times per unit of uv, unless the texture has its own `uv_scale`.
+    `uv_scale` is the default for textures that `changed` adds: the number of times that a texture repeats per unit of
+    uv.
     """
 
     name: str

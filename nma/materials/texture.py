@@ -35,8 +35,8 @@ class Texture:
     def read(self) -> NDArray[np.float32]:
         """Reads the parameter's values (height, width, 1 or 3); row 0 is the top of the image.
 
-        Raises `TextureError` if the file cannot be read, or if a value is not finite or not valid. A coloured image for
-        a parameter of one number, without a chosen channel, is an error, too.
+        Raises `TextureError` if the file cannot be read, if a value is not finite or not valid, or if a parameter of
+        one number has a coloured image and no chosen channel.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite raise an error below
             values = self._pixels() * np.float32(self.scale) + np.float32(self.offset)
@@ -124,7 +124,10 @@ def _bitmap(path: Path) -> Any:
 
 
 def is_coloured(rgb: NDArray[np.float32]) -> bool:
-    """Whether the channels of any pixel differ by more than `ROUNDING`, or by this fraction of a value above 1."""
+    """Whether any pixel is coloured, which means that its channels differ by more than rounding explains.
+
+    The limit is `ROUNDING`, or `ROUNDING` times the pixel's red value if this value is above 1.
+    """
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)
     return bool((spread > ROUNDING * np.maximum(np.abs(rgb[..., 0]), 1.0)).any())

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from nma.sources.base import Source, Values
     from nma.sources.files import Format
 
-# An entry of either registry has the form `module:name`: a module of this folder, and a name defined in the module. The
-# module is imported when the entry is first used. The keys of `CLASSES` are the classes that can be simulated, and the
-# values are their sources. The `space` of a source has the parameters of its class.
+# The entries of `CLASSES` and `FORMATS` have the form `module:name`: a module of this folder, and a name defined in the
+# module. The module is imported when the entry is first used. The keys of `CLASSES` are the classes that can be
+# simulated, and the values are their sources. The `space` of a source has the parameters of its class.
 CLASSES = {"layered3": "layered:Layered3"}
 # Formats of files that store BRDF values, by the extension of the files:
 FORMATS = {

@@ -73,7 +73,8 @@ class Values(Protocol):
 
     `name` is the model's name in messages. `isotropic` is true if the value stays the same when both directions are
     rotated about the normal by the same angle. An isotropic model may still have different values for a pair of
-    directions and for the mirror image of the pair; a folded bin of a table holds the mean of the two values.
+    directions and for the mirror image of the pair. A bin of an isotropic table covers both pairs, so the bin's value
+    is the mean of the two values.
     """
 
     @property

@@ -27,8 +27,8 @@ _KNOWN = {name: known for m in MEASUREMENTS for name, known in m.known.items()}
 class Finding:
     """The result of `check` for one file.
 
-    `measurements` is the name of the measurements that the file belongs to. `ok` is true if the file is undamaged, and
-    `note` gives the reason.
+    `measurements` is the name of the measurements that the file belongs to. `ok` is true if the file is valid and does
+    not differ from the original file in size or checksum, if these are known. `note` says what the check found.
     """
 
     path: Path

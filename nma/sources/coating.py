@@ -88,6 +88,9 @@ def _lobe(wi: Vec3, wo: Vec3, alpha: float) -> Float:
 
 
 def _refracted(w: Vec3, eta: float) -> tuple[Vec3, Float]:
-    """The direction `w` refracted at the mean surface, mirrored to point up, and the fraction of reflected light."""
+    """Refracts `w` at the mean surface.
+
+    Returns the refracted direction, mirrored to point up, and the fraction of the light that the surface reflects.
+    """
     loss, cos_t = fresnel_dielectric(w.z, eta)
     return Vec3(w.x / eta, w.y / eta, cos_t), loss

@@ -15,7 +15,7 @@ class Measurements:
     """Published measurements of materials, or neural reconstructions of measurements; `kind` tells which of the two.
 
     `files` describes the files of a complete copy. `known` maps the name of a file to its size in bytes and its
-    SHA-256. `known` lacks the files that we had no copy of.
+    SHA-256. Files that were not available to us are missing in `known`.
     """
 
     name: str
@@ -34,9 +34,9 @@ class Format:
     A format's functions raise `SourceError` for a damaged file. `read(path)` returns the values (`Values`) of the
     material in a file. If a file holds several materials, `names(path)` lists their names, and `read(path, name)`
     returns the values of the material `name`. `measurements` are the published measurements that have this format.
-    `identify(path)` reads the whole file and returns the name of the measurements that the file belongs to. For a
-    damaged file, messages use the format's `name` instead of the name of its measurements. `claims(path)` tells whether
-    a file with the format's extension does have this format, since other formats may have the same extension.
+    `identify(path)` reads the whole file and returns the name of the measurements that the file belongs to. If the file
+    is damaged, the format's `name` is shown instead of the name of the measurements. `claims(path)` tells whether a
+    file with the format's extension does have this format, since other formats may have the same extension.
     """
 
     name: str

@@ -1,16 +1,22 @@
 """Evaluates the layered source at a pair of directions: an unbiased estimate of f cos(theta_o), and a density of wo.
 
-Random walks estimate the light that leaves in a set of directions. A renderer also needs the value at a single pair
-(wi, wo), which this module estimates. The light from wi to wo is split into three kinds:
+A renderer needs the value at a single pair of directions (wi, wo), but a random walk from wi leaves along a given wo
+with probability 0. So this module starts one walk from wi and another walk from wo, and joins the two walks into one
+path (bidirectional path sampling). The event at which the walks are joined is called the connection. Both directions of
+this event are known, so its density is evaluated, while all other events of the path are drawn at random.
+
+The light from wi to wo is split into three kinds:
 
 - Light that the coat's upper side reflects, for which there is a closed form.
-- Light that enters the coat and meets interfaces only.
-- Light that enters the coat and scatters in the medium at least once.
+- Light that is refracted into the coat and never scatters in the medium (`_unscattered`).
+- Light that is refracted into the coat and scatters in the medium at least once (`_scattered`).
 
-For the last two kinds, a walk from wi is connected with a walk from wo, so that the estimate never depends on two
-narrow lobes that meet by chance (compare Guo, Hasan and Zhao 2018, section 5). Densities and throughputs are those of
-particles, as in the random walk of `nma.sources.layered`. Unlike radiance, densities of particles do not change by the
-squared index of refraction when a walk enters the coat.
+A connection at a narrow lobe gives a noisy estimate, because directions that were drawn independently seldom fit the
+lobe. So `_unscattered` prefers connections at wide lobes, and `_scattered` connects walks only in the medium, which
+scatters into all directions (compare Guo, Hasan and Zhao 2018, section 5).
+
+Throughputs count particles, as in the random walk of `nma.sources.layered`. So, unlike radiance, a throughput does not
+change by the squared index of refraction when a walk enters the coat.
 """
 
 from __future__ import annotations
@@ -51,16 +57,16 @@ def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True)
     """One unbiased estimate per lane of f(wi, wo) cos(theta_o) [1/sr], for wi.z > 0 and wo.z > 0.
 
     `stack` must come from `match_index`. The integral of the estimate's expected value over a set of directions wo
-    equals the expected throughput that `nma.sources.base.walk` carries out of the material in these directions.
+    equals the expected throughput of the walks (`nma.sources.base.walk`) that leave the material in these directions.
     """
     there, back = _enter(stack, wi, rng), _enter(stack, wo, rng)
     there.alive = back.alive = there.alive & back.alive & active
     forward, _ = _unscattered(stack, wi, there, wo, back, rng, True)
     backward, detour = _unscattered(stack, wo, back, wi, there, rng, False)
     scattered = _scattered(stack, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
-    # Walks from wo estimate f cos(theta_i). Since f is reciprocal, the factor cos(theta_o) / cos(theta_i) turns the
-    # estimate into f cos(theta_o). Light that scatters in the medium is connected below the coat, where radiance is
-    # larger by the squared index of refraction, so this light is divided by the squared index.
+    # Walks from wo estimate f cos(theta_i). Since f is reciprocal, this estimate times cos(theta_o) / cos(theta_i) is
+    # an estimate of f cos(theta_o). `scattered` is an estimate below the coat. When light leaves the coat, its radiance
+    # is divided by the squared index of refraction, so `scattered` is divided by the squared index, too.
     index2 = stack.eta_top * stack.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(stack, wi, wo)
@@ -103,14 +109,21 @@ def _transmittance(stack: Stack, depth: Float, w: Vec3) -> Float:
 
 @dataclass
 class _Detour:
-    """One segment of a walk, chosen from all but the first segment by weighted reservoir sampling (Chao 1982)."""
+    """One segment of a walk, chosen at random from all but the first segment.
+
+    The choice is weighted reservoir sampling (Chao 1982), which needs no list of the segments. `tint` is the chosen
+    segment's throughput divided by its weight, and `total` is the sum of the weights of all segments so far.
+    """
 
     direction: tuple[Float, Float, Float]
     tint: tuple[Float, Float, Float]
     total: Float
 
     def offer(self, walk: Walk, rng: Random) -> _Detour:
-        """Chooses the current segment of `walk` instead, with a probability proportional to its brightest channel."""
+        """Considers the current segment of `walk`, and either chooses this segment or keeps the previous choice.
+
+        A segment's weight is the brightest channel of its throughput. Its probability is proportional to its weight.
+        """
         weight = ops.select(walk.alive, ops.max_component(throughput(walk)), 0.0)
         total = self.total + weight
         take = rng.next_float32() * total < weight
@@ -129,17 +142,23 @@ class _Detour:
 def _unscattered(
     stack: Stack, wi: Vec3, there: Walk, wo: Vec3, back: Walk, rng: Random, forward: bool
 ) -> tuple[Color, tuple[Vec3, Color]]:
-    """Estimates light from wi to wo that meets interfaces only; `_Detour` chooses one segment of the walk `there`.
+    """Estimates light from wi to wo that never scatters in the medium, and chooses one segment (`_Detour`) of `there`.
 
-    A path enters through the coat, hits the conductor once or more, and leaves through the coat. The path is sampled
-    from both ends, wi and wo. All events of the path are drawn at random except one, the connection, at which the two
-    ends are joined and whose density is evaluated. The best connection is the event with the widest lobe.
+    A path enters through the coat, hits the conductor once or more, and leaves through the coat. The walk `there` from
+    wi is connected with wo in two ways at each hit of the conductor:
 
-    A walk from wi can be connected at two events. If the connection is the exit, the density of being refracted out
-    along wo is evaluated. If the connection is the last hit of the conductor, the exit is drawn from wo, as the walk
-    `back`. A walk from wo can be connected at the entrance or at the first hit. A path with a single hit thus has three
-    possible connections: entrance, hit and exit. The balance heuristic (Veach 1997, eq. 9.8) gives each connection a
-    weight proportional to its bluntness, which is the reciprocal of the event's density.
+    - Connection at the hit: the conductor reflects the walk into the first segment of `back`, along which light leaves
+      towards wo.
+    - Connection at the exit: the walk is reflected in a random direction, and the coat refracts the light along wo.
+
+    If `forward` is false, the caller has exchanged wi and wo. The connections of this second call are then at the
+    path's first hit and at its entrance. If a path has a single hit, the first hit is also the last hit, so only the
+    first call connects at this hit.
+
+    The balance heuristic (Veach 1997, eq. 9.8) weights the connections of a path by the density of sampling the path
+    with each connection. All events except the connection are sampled, so this density is that of the whole path
+    divided by the density of the connection. So the weight of a connection is proportional to its bluntness, which is
+    the reciprocal of its density.
     """
     source, clear = Layered3(), replace(stack, sigma_t=stack.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
@@ -148,14 +167,15 @@ def _unscattered(
     matched = stack.eta_top == 1.0
 
     def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
-        """Light that a hit of the conductor sends to wo, and the bluntness of the walk's first hit.
+        """Estimates the light of the two connections at one hit of the conductor.
 
-        `first` is 0 before the first hit, and then the bluntness (reciprocal density) of the first hit.
+        `before` is the walk before this hit, and `after` the walk after it. `first` is the bluntness of the walk's
+        first hit, or 0 if this hit is the first. Returns the estimate, and the bluntness of the first hit.
         """
         w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
         rest = way_in + first
-        # Connect at the last hit. Under an index-matched coat, which reflects no light, the last hit is the only
-        # connection.
+        # Connect at this hit. An index-matched coat neither reflects nor deflects light, so its paths have a single hit
+        # and can be connected only there.
         q, t = drawn_out
         blunt = _bluntness(_sharpness(stack, w_in, drawn_up))
         share = ops.select(matched, 1.0, blunt / (blunt + rest + _bluntness(q)))
@@ -165,7 +185,7 @@ def _unscattered(
             _mirror_pdf(_above(w_in), drawn_up, stack.alpha_bottom) * t * _transmittance(stack, 1.0, drawn_up)
         )
         found = throughput(before) * _conductor_weight(stack, w_in, drawn_up) * (share * meets)
-        # Connect at the exit.
+        # Connect at the exit after this hit.
         q, t = _out_through_coat(stack, wo, went_up)
         blunt = _bluntness(_sharpness(stack, w_in, went_up))
         share = ops.select(matched, 0.0, _bluntness(q) / (_bluntness(q) + blunt + rest))
@@ -189,9 +209,9 @@ def _unscattered(
 def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: Random) -> Color:
     """Estimates the light that scatters in the medium.
 
-    Every scattering vertex of the walk is connected to each exit path in `ways`. An exit path is one segment, given by
-    direction and throughput, of a walk from wo that met interfaces only. The medium scatters into all directions, so
-    the connection transports light however narrow the lobes of the exit path are.
+    The walk `there` from wi scatters in the medium. Each point where the walk scatters is connected to both segments in
+    `ways`, which belong to the walk from wo: the first segment, and a later segment that was chosen at random. A
+    segment is given by its direction and its throughput.
     """
     source = Layered3()
 
@@ -199,8 +219,8 @@ def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: R
         after = source.step(stack, walk, rng)
         out = Color.of(0.0)
         for d, reached in ways:
-            # The light travels in the opposite direction of the segment: from the vertex to the interface where the
-            # segment began.
+            # The segment began at the coat if `d` points down, else at the conductor. The light travels against `d`,
+            # from the point where it scatters to that interface.
             depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
             out = out + reached * (_transmittance(stack, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
         found = throughput(walk) * Color(*stack.albedo) * out * _ISOTROPIC_PHASE
@@ -219,7 +239,10 @@ def _bluntness(density: Float) -> Float:
 
 
 def _sharpness(stack: Stack, w_in: Vec3, up: Vec3) -> Float:
-    """Approximate density [1/sr] of the conductor's reflection from `w_in` to `up`, or from `up` to `w_in`."""
+    """Approximate density [1/sr] with which the conductor reflects a walk from `w_in` into `up`.
+
+    The density of the reverse reflection, from `up` into `w_in`, is taken to be the same.
+    """
     return 0.25 * ggx_d(ops.normalize(w_in + up), stack.alpha_bottom, stack.alpha_bottom)
 
 
@@ -232,12 +255,15 @@ def _conductor_weight(stack: Stack, w_in: Vec3, up: Vec3) -> Color:
 
 
 def _out_through_coat(stack: Stack, wo: Vec3, up: Vec3) -> tuple[Float, Float]:
-    """The density q of refraction into the coat, and a factor t for refraction out of the coat.
+    """Returns (q, t) for light that travels along `up` inside the coat and leaves the coat along `wo`.
 
-    q [1/sr] is the density of `up` when light from wo is refracted down at a visible normal. The product of q and t is
-    the density of wo when light along `up` is refracted out. In the quotient t of the two densities, the microfacet
-    distribution and the Jacobian cancel. The half vector is that of Walter 2007, eq. 16, and the Jacobian that of eq.
-    17.
+    q [1/sr] is the density with which a walk from wo is refracted into the opposite direction of `up`. q t [1/sr] is
+    the density with which light along `up` is refracted into wo, times the fraction of the light that passes. If `up`
+    was drawn with the density q, the estimate is q t divided by q, which is t. In t the microfacet distribution and the
+    Jacobian cancel, so t has no peak, however narrow the coat's lobe is. The half vector is that of Walter 2007, eq.
+    16, and the Jacobian that of eq. 17.
+
+    An index-matched coat does not deflect light, so q would be infinite, and 0 is returned for q.
     """
     alpha, eta = stack.alpha_top, stack.eta_top
     matched = eta == 1.0

@@ -26,8 +26,8 @@ from nma.sources.files import Format
 # rounding errors.
 _PAIRS = 512
 _ROUNDING = 1e-3
-# A direction whose cosine is below `_MIN_COS` is raised to this cosine. The reason: for two opposite directions at the
-# horizon, single precision cannot represent the half vector, and Mitsuba's measured and rough BSDFs return NaN.
+# A direction whose cosine is below `_MIN_COS` is raised to this cosine. Otherwise Mitsuba's measured and rough BSDFs
+# would return NaN for two opposite directions at the horizon, whose half vector is imprecise in single precision.
 _MIN_COS = 1e-6
 
 

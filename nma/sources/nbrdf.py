@@ -27,15 +27,15 @@ from nma.sources.half_difference import half_difference
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# The names of the two published sets of networks, each under a material that only one set contains. A weights file with
-# such a material belongs to the set.
+# There are two published sets of networks. A weights file is recognised by a material that only one of the sets
+# contains (the keys); the values are the names of the sets.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
 class Nbrdf:
     """One material's network (`Values`).
 
-    The network has learned reciprocity and symmetry, so both are only approximate.
+    The network learned reciprocity and symmetry from data, so it has these properties only approximately.
     """
 
     isotropic = True
@@ -87,7 +87,7 @@ def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
             names, weights = f["names"], f["weights"]
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; `nma data` says where to get NBRDF networks") from None
-    except Exception as e:  # zipfile and zlib raise exceptions of their own, so all are caught
+    except Exception as e:  # zipfile and zlib have error types of their own
         raise SourceError(
             f"{path}: not a weights file of NBRDF networks (.npz with names and weights): {e}"
         ) from None
@@ -114,7 +114,7 @@ def _claims(path: Path) -> bool:
     try:
         with arrays(path) as f:
             return "weights" in f
-    except Exception:  # zipfile raises exceptions of its own, so all are caught
+    except Exception:  # zipfile has error types of its own
         return False
 
 

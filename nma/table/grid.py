@@ -72,8 +72,8 @@ class Tables:
 
     `params` (n, columns) are the parameters of the materials, and `values` (n, *grid.shape) are their tables. `walks`
     (n,) has the number of random walks of each material. `error` has the standard error of each value, or is None.
-    `class_name` is the class of all materials. If `class_name` is not given, it is the only class whose parameters have
-    as many columns as `params`. Raises `TableError` if no class, or more than one class, has this number of columns.
+    `class_name` is the class of all materials. If no `class_name` is given, the class is found by the number of columns
+    of `params`. Raises `TableError` if no class, or more than one class, has this number of columns.
     """
 
     params: NDArray[np.float64]
@@ -114,7 +114,7 @@ class Tables:
             )
         errors = [t.error for t in parts if t.error is not None]
         if errors and len(errors) < len(parts):
-            raise TableError("tables with and without standard errors cannot be joined")
+            raise TableError("tables that have standard errors cannot be joined with tables that have none")
         return Tables(
             np.concatenate([t.params for t in parts]),
             np.concatenate([t.values for t in parts]),

@@ -17,7 +17,7 @@ from nma.ops import Float, Vec3
 from nma.table.grid import ISOTROPIC, Grid
 
 # The density of points increases towards the mirror direction, down to the scale of a lobe of this microfacet width
-# (alpha). The width is half that of the narrowest lobe, because with coarser points training makes the narrowest lobes
+# (alpha). The width is half that of the narrowest lobe, because training with coarser points makes the narrowest lobes
 # too broad.
 FINEST = 0.0005
 
@@ -92,8 +92,8 @@ def anisotropic_bin_points(
     """Maps the point `u` of the unit cube to directions in the bin (theta_i, phi_i, theta_o, phi_o) = (i, a, o, b)."""
     near_mu, near_phi = _scales(i, grid, finest)
     mu_i, mu_o, weight = _cosines(i, o, u[0], u[1], grid, near_mu)
-    # psi is the azimuth of wo minus the azimuth of wi minus pi, so psi is 0 at the mirror direction, where points are
-    # denser. `centre` is psi for the middles of the two bins, as an angle from -pi to pi.
+    # psi is the azimuth between wo and the mirror direction: the azimuth of wo minus the azimuth of wi minus pi. Points
+    # are denser around psi = 0. `centre` is psi for the middles of the two bins, as an angle from -pi to pi.
     step_i, step_o = 2.0 * math.pi / grid.phi_i, 2.0 * math.pi / grid.phi_o
     centre = (b + 0.5) * step_o - (a + 0.5) * step_i
     centre = centre - (2.0 * math.pi) * ops.floor(centre * (0.5 * ops.INV_PI)) - math.pi
@@ -134,8 +134,9 @@ def _pair(
     (low_x, width_x), (low_y, width_y) = x, y
     reach = 0.5 * (width_x + width_y)
     s, density = _crowd(u, centre - reach, centre + reach, scale)
-    # `room` is the length of the interval of numbers in `x` for which `y` contains a number that is larger by s. As a
-    # function of s, `room` has the shape of a triangle, or of a trapezoid if the widths of the bins differ.
+    # s is the number in `y` minus the number in `x`. With this s, only an interval of numbers in `x` is possible;
+    # `room` is the interval's length. As a function of s, `room` has the shape of a triangle, or of a trapezoid if the
+    # widths of the bins differ.
     room = ops.minimum(reach - ops.absolute(s - centre), min(width_x, width_y))
     room = ops.maximum(room, 1e-7 * width_x)
     # Draw the number in `x` uniformly from the interval of length `room`.

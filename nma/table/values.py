@@ -1,7 +1,7 @@
 """Makes tables of sources that can be evaluated (`Values`), and evaluates tables as such sources.
 
-The value of a bin is the mean of f cos(theta_o) over fixed points in the bin. A table can be evaluated, too: every pair
-of directions has the value of the bin that contains it.
+The value of a bin is the mean of f cos(theta_o) over fixed points in the bin. A table can be evaluated, too: the value
+at a pair of directions is the value of the bin that contains the pair.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from nma.sources.lookup import Lookup
 from nma.table import quadrature
 from nma.table.grid import ISOTROPIC, Grid, Tables
 
-# The default number of points per bin. Bins near the mirror direction get `_NEAR` times as many points, with a density
-# that increases towards the mirror direction. Bins near the mirror direction are few, and they contain the peaks of
-# smooth materials.
+# The default number of points per bin. Bins near the mirror direction contain the peaks of smooth materials, so they
+# get `_NEAR` times as many points, with a density that increases towards the mirror direction. The additional points
+# cost little time, because such bins are few.
 POINTS = 128
 _NEAR = 32
-# A bin counts as near if its theta_o is less than this many bins from the mirror direction.
+# A bin counts as near the mirror direction if its theta_o is less than this many bins away from the mirror direction.
 _REACH = 4.5
 
 # A bin's points are divided into this many independent sets. The spread of the sets' means gives the standard error.
@@ -87,8 +87,8 @@ def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
     """Marks the bins whose wo may be close to the mirror direction of their wi."""
     i, a, o, b = _indices(bins, grid)
     near_o = _apart(i, grid.theta_i, o, grid.theta_o) < _REACH
-    # If both directions are close to the normal, so is the half vector, whatever the azimuths are. So bins close to the
-    # normal count as near the mirror direction at every azimuth.
+    # If both directions are close to the normal, the half vector is close to the normal, too, whatever the azimuths
+    # are. So bins close to the normal count as near the mirror direction at every azimuth.
     top = (i == grid.theta_i - 1) & (o == grid.theta_o - 1)
     if not grid.phi_i:
         return near_o & (b >= grid.phi_o - 2) | top
@@ -129,8 +129,8 @@ def _means(
         raise TableError(f"{values.name}: has values that are not finite, first in bin {place}")
     weight, square, value, product = sets[..., :1], sets[..., 1:2], sets[..., 2:5], sets[..., 5:]
     # The weights serve as a control variate, because their expected value is known to be 1. If the mean weight of a set
-    # is not 1, this deviation explains a part of the error of the mean value; the part is subtracted. If the source
-    # hardly changes within a bin, the mean value becomes almost exact.
+    # is not 1, the mean value of the set has an error that is correlated with this deviation, and this part of the
+    # error is subtracted. If the source hardly changes within a bin, the mean value becomes almost exact.
     variance = np.mean(square - weight * weight, axis=0)
     covariance = np.mean(product - weight * value, axis=0)
     slope = np.where(variance > _UNWEIGHTED, covariance / np.maximum(variance, _UNWEIGHTED), 0.0)

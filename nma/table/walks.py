@@ -19,8 +19,8 @@ from nma.table.grid import ISOTROPIC, Grid, Tables
 
 # Throughputs are summed as integers in units of 2^-16, because an integer sum does not depend on the order of addition.
 _UNIT = 65536.0
-# The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1, so a quarter
-# of the counter's range is left for throughputs above 1.
+# The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1. Only three
+# quarters of these walks are allowed, because some throughputs may be above 1.
 _WALKS_PER_ROW = 49151
 # The most bins of all materials in one kernel launch, which limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 21
@@ -87,8 +87,8 @@ def _tabulate_group(
     if not error:
         return moments[0] / weight, None
     sums, squares = moments
-    # If all walks of a row end in one bin with the same throughput, their variance is 0. The variance of a single hit
-    # is used instead, so that the standard error is not 0.
+    # If all walks of a row end in one bin with the same throughput, the variance of their throughputs is 0. The
+    # variance of a single hit is used instead, so that the standard error is not 0.
     variance = np.maximum(squares - sums * sums / sweeps, squares / sweeps)
     return sums / weight, np.sqrt(variance) / weight
 
@@ -119,7 +119,7 @@ def _launch(
 
 
 def _mix(x: Any) -> Any:
-    """The finaliser of MurmurHash3, which maps neighbouring integers to unrelated ones."""
+    """The finaliser of MurmurHash3, which maps neighbouring integers to unrelated integers."""
     x = (x ^ (x >> 33)) * 0xFF51AFD7ED558CCD
     x = (x ^ (x >> 33)) * 0xC4CEB9FE1A85EC53
     return x ^ (x >> 33)

@@ -69,8 +69,8 @@ class Pool:
     def albedo_at(self, m: NDArray, i: NDArray, a: NDArray, mu: NDArray) -> NDArray:
         """The directional albedo (rows, 3) of materials `m` at cosines `mu` in the rows `i` (and `a`).
 
-        The albedo is taken as linear within a row: its mean is that of the row, and its slope is that between the two
-        neighbouring rows.
+        Within a row, the albedo is interpolated by a straight line. The line's mean is the albedo of the row, and its
+        slope is that between the two neighbouring rows.
         """
         last = self.grid.theta_i - 1
         above, below = np.minimum(i + 1, last), np.maximum(i - 1, 0)

@@ -39,7 +39,7 @@ RECIPE = Recipe(
     steps=60_000,
 )
 
-# The recipe for finding one code. The network is fixed, so a thousand steps are enough.
+# The recipe for finding the code of one new material. The network is fixed, so a thousand steps are enough.
 ENCODING = replace(RECIPE, learning_rate=3e-2, average=0.99, steps=1_000)
 
 # The search for a code starts at the codes of this many materials, and at the mean of all codes.
@@ -143,8 +143,8 @@ def encode(
 def code_of(free: Any) -> Any:
     """Converts the free variables of the optimisation to codes.
 
-    Free variables may be any real numbers. Codes lie within the range of the class; near 0 a code almost equals its
-    variable.
+    Free variables may be any real numbers. Codes lie within the range of the class. A code near 0 almost equals its
+    free variable.
     """
     return CODE_BOUND * jnp.tanh(free * (1.0 / CODE_BOUND))
 
@@ -155,9 +155,10 @@ def free_of(code: NDArray) -> NDArray:
 
 
 def objective(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The loss of the weights (free variables of the codes, layers).
+    """The loss to minimise, and the log loss.
 
-    The batch's only column has each row's material index.
+    `weights` is (the free variables of the codes, the network's layers). The batch has one column, with the index of
+    each row's material.
     """
     free, layers = weights
     codes = code_of(free)[batch.columns[0].astype(jnp.int32)]
@@ -171,7 +172,7 @@ def _held(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Ar
 
 
 def _source(tables: Tables, recipe: Recipe) -> Callable[[int], Batch]:
-    """A function that returns the batch of a step. The batch's only column is the index of each row's material."""
+    """A function that returns the batch of a step. The batch has one column: the index of each row's material."""
     pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
     pool.params = np.arange(len(tables.values), dtype=np.float32)[:, None]
     return lambda step: draw(pool, sampler, recipe, step)

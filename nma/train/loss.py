@@ -32,7 +32,7 @@ def network_outputs(layers: Layers, batch: Any, recipe: Recipe) -> jax.Array:
 
 
 def brdf_of(layers: Layers, batch: Any, recipe: Recipe) -> Brdf:
-    """The target of each row, with parameters (rows,).
+    """The target of each row; its parameters have the shape (rows,).
 
     In isotropic batches wi has azimuth 0, so the frame of the plane of incidence equals the local frame.
     """
@@ -86,7 +86,7 @@ def loss(layers: Layers, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.A
 
 
 def brdf_loss(brdf: Brdf, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The same as `loss`, for a target whose parameters are constant or (rows,)."""
+    """The same as `loss`, for a target whose parameters are constants, or have the shape (rows,)."""
     total, log_loss = distance(bin_means(brdf, batch, recipe), batch, recipe)
     return total + albedo_loss(brdf, batch, recipe), log_loss
 
@@ -95,26 +95,30 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     """The squared error of the directional albedo, times its weight in the recipe."""
     if not recipe.albedo > 0:
         return 0.0
-    # The two estimates are independent, so the mean of the product of their errors is the squared error, without the
-    # variance of the estimates.
+    # The square of a noisy estimate's error would contain the variance of the estimate. The expected product of the
+    # errors of two independent estimates does not contain this variance.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 
 
 def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The distance that the recipe chooses, and the log loss, from bin means (3, bins_per_row, rows) to the tables."""
+    """Compares the target's bin means (3, bins_per_row, rows) with the values of the tables.
+
+    Returns the error measure that the recipe's `loss` names, and the log loss.
+    """
     residual = jnp.log1p(mean) - jnp.log1p(batch.value)
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":
         return log_loss, log_loss
-    # sigma is the standard error of the logarithm, from counting statistics. If the target is right, about expected /
-    # quantum walks end in the bin. One walk is added, so that sigma is never 0.
+    # sigma is the standard error of the residual, from counting statistics. Each walk that ends in a bin adds `quantum`
+    # to the bin's value, so a bin of mean value `expected` has about expected / quantum walks. One walk is added, so
+    # that sigma is never 0.
     expected = jax.lax.stop_gradient(mean)
     sigma = jnp.sqrt(batch.quantum * (expected + batch.quantum)) / (1.0 + expected)
     width = 3.0 * sigma + _TOLERANCE
     size = jnp.abs(residual)
     huber = jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)
-    # `emphasis` adds the error of the value itself, with the weight `energy`: an error d of log(1 + value) is an error
-    # of about (1 + value) d of the value.
+    # `emphasis` adds the error of the value itself, with the weight `energy`. If log(1 + value) has the error d, the
+    # value has an error of about (1 + value) d.
     emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
     return (huber * emphasis * batch.weight).mean(), log_loss

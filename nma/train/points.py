@@ -1,8 +1,8 @@
 """Training data for sources whose values are known (`Values`): their values at pairs of directions.
 
-A table has only the averages over bins, so for a table the target must be averaged over bins. A source with known
-values is compared with the target at single pairs of directions, which needs an eighth of the evaluations of the
-target.
+A table has only the averages over bins, so for a table the target must be averaged, too, by default over 8 points per
+bin. A source with known values is compared with the target at single pairs of directions, which needs one evaluation of
+the target instead of 8.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from nma.target.sampling import sample_spec
 from nma.train.loss import albedo_loss, brdf_of, view
 from nma.train.recipe import Recipe
 
-# Number of directions wi of the pool (rows), and number of directions wo for each direction wi.
+# Number of directions wi of the pool (its rows), and number of directions wo for each direction wi.
 ROWS, POINTS = 8192, 512
 # One of this many directions wo is drawn near the mirror direction; the other directions are uniform. A share of a
 # quarter is enough to find narrow lobes. A larger share would make the fit of smooth parts of the material worse.
@@ -45,7 +45,7 @@ class PointBatch(NamedTuple):
     mu: NDArray[np.float32]  # (rows,) cos(theta_i)
     phi: NDArray[np.float32]  # (rows,) azimuth of wi
     wo: NDArray[np.float32]  # (3, points, rows)
-    weight: NDArray[np.float32]  # (points, rows) weights of mean 1, for the uneven density of wo
+    weight: NDArray[np.float32]  # (points, rows) mean 1, corrects for the uneven density of wo
     value: NDArray[np.float32]  # (3, points, rows)
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at wi
     albedo_shift: NDArray[
@@ -66,9 +66,9 @@ class PointPool:
 
     @staticmethod
     def of(source: Values, *, seed: int = 0, rows: int = ROWS, points: int = POINTS) -> PointPool:
-        """The pool of a source, determined by the seed. Negative values (colours out of gamut) become 0.
+        """Evaluates a source at pairs of directions that the seed determines.
 
-        Raises `SourceError` for values that are not finite.
+        Negative values (colours out of gamut) become 0. Raises `SourceError` for values that are not finite.
         """
         rng = np.random.default_rng((seed, 0x9017))
         # Every row has its own stratum of cos(theta_i).

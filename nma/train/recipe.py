@@ -125,7 +125,7 @@ PAPER = Recipe(
     average=0.0,
 )
 
-# For one material: a small network with the direction as its only input.
+# This recipe is for one material, so its network is small and has the direction as its only input.
 SINGLE = Recipe(
     network="3x32",
     encoding="direction",
@@ -140,12 +140,13 @@ SINGLE = Recipe(
     steps=6_000,
 )
 
-# For one material whose values have no noise: a measurement, a tabulated material, or a BSDF of another program.
+# This recipe is for one material whose values have no noise: a measurement, a tabulated material, or a BSDF of another
+# program.
 MEASURED = replace(
     SINGLE,
     target="measured",
-    # The bound on the reflected light ignores the fade of lobes, so it would dim bright lobes that are faded out
-    # anyway.
+    # The bound on the reflected light ignores that lobes may be faded out, so the bound would dim bright lobes that
+    # reflect little light anyway.
     bounded=False,
     rows=512,
     bins_per_row=64,
