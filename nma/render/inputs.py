@@ -291,8 +291,9 @@ def _channel(param: Param, props: Any, value: Any) -> int | None:
         return None
     wanted = props[name]
     if param.size > 1 or not isinstance(value, mi.Texture):
+        fault = "more than one number" if isinstance(value, mi.Texture) else "no texture"
         raise ParamError(
-            f"{name} chooses a channel of a texture for a parameter of one number; leave {name} out"
+            f"{name} chooses a channel of a texture, but {param.name} has {fault}; leave {name} out"
         )
     if wanted not in COLOUR:
         raise ParamError(f"{name} is {wanted!r}; choose {either(COLOUR)}")

@@ -186,7 +186,8 @@ private:
         if (!props.has_property(name)) return -1;
         const std::string wanted(props.get<std::string_view>(name));
         if (!input.texture || input.param.size > 1)
-            Throw("%s chooses a channel of a texture for a parameter of one number; leave %s out", name, name);
+            Throw("%s chooses a channel of a texture, but %s has %s; leave %s out", name, input.param.name,
+                  input.texture ? "more than one number" : "no texture", name);
         const auto place = std::string_view("rgb").find(wanted);
         if (wanted.size() != 1 || place == std::string_view::npos) Throw("%s is '%s'; choose r, g or b", name, wanted);
         return static_cast<int>(place);

@@ -80,7 +80,7 @@ inline Vec conductor(float cosine, const Stack& stack) {
 }
 
 // The fraction of the light along `w` that crosses a layer of the slab without scattering or absorption. `depth` is the
-// thickness of that layer, as a fraction of the slab.
+// thickness of the crossed layer, as a fraction of the slab.
 inline float transmittance(const Stack& stack, float depth, const Vec& w) {
     return stack.sigma_t > 0.0f ? exp(-stack.sigma_t * depth / maximum(absolute(w.z), 1e-7f)) : 1.0f;
 }
