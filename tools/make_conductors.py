@@ -18,11 +18,11 @@ from nma.files import write_text
 OUT = Path(__file__).parents[1] / "nma" / "conductors" / "conductors.csv"
 HEADER = ("name", "eta_r", "eta_g", "eta_b", "k_r", "k_g", "k_b", "held_out")
 
-# A material whose k is below this limit in any channel is a tinted dielectric, and is omitted. The smallest k of the
+# A material whose k is below MIN_K in any channel is a tinted dielectric, and is omitted. The smallest k of the
 # remaining materials is .114.
 MIN_K = 0.1
 
-# The substances in HELD_OUT are not used for training, so that they can test adapters on unseen metals. The list has an
+# The substances in HELD_OUT are not used for training, so that adapters can be tested on unseen metals. HELD_OUT has an
 # alkali metal, a refractory metal, a bright metal, a liquid metal, a nitride that looks like gold, a metal whose eta
 # rises towards blue, a weakly absorbing oxide, and amorphous carbon. Mitsuba has several data files for some substances
 # (`Hg`, `Hg_palik`). None of the files of a test substance is used for training; otherwise the test would contain

@@ -21,7 +21,7 @@ __all__ = ["TrainingBar", "counting", "err", "loss_plot", "number", "out", "prog
 out = Console()
 
 _GAP = 2
-# A cell with more characters than this is treated as a sentence, which may be wrapped between words.
+# A cell with more characters than `_SENTENCE` is treated as a sentence, which may be wrapped between words.
 _SENTENCE = 24
 
 

@@ -17,9 +17,9 @@ def number(help: str, low: float, high: float, **more: Any) -> Any:
 
 
 def _no_nan(value: float | None) -> float | None:
-    """Rejects NaN, which some versions of typer accept although it is not within the bounds."""
+    """Rejects NaN, which some versions of typer accept although NaN is not within the bounds."""
     if value is not None and value != value:
-        raise typer.BadParameter("NaN is not a number between the bounds")
+        raise typer.BadParameter("NaN is not allowed; give a number")
     return value
 
 
@@ -92,7 +92,7 @@ VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, 
 # Options of commands that train.
 Weights = Annotated[Path, output("The weights file to write.", ".safetensors")]
 Variant = Annotated[
-    str, choice("blended: two instances. omega_i: their parameters follow the view direction.", *VARIANTS)
+    str, choice("blended: two instances. omega_i: parameters depend on the view direction.", *VARIANTS)
 ]
 Network = Annotated[
     str | None,

@@ -15,7 +15,7 @@ from nma.cli import console, options, reading
 if TYPE_CHECKING:
     from nma.target import Principled
 
-# If the mean error of the directional albedo exceeds this limit, the error is visible in pictures, so the command
+# If the mean error of the directional albedo exceeds ALBEDO_LIMIT, the error is visible in pictures, so the command
 # prints a warning.
 ALBEDO_LIMIT = 0.05
 
