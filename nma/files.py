@@ -30,8 +30,8 @@ def whole(path: str | Path) -> Iterator[Path]:
         with whole("gold.npz") as file:
             np.savez(file, ...)
 
-    The temporary file has the same suffix as `path`. Missing folders are made. If `path` exists, the new file has the
-    permissions of the old file. Raises `OutputError` if the file cannot be written.
+    The temporary file has the same suffix as `path`. Missing folders are created. If `path` exists, the new file has
+    the permissions of the old file. Raises `OutputError` if the file cannot be written.
     """
     path = Path(path)
     place = _place(path)
@@ -55,7 +55,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """A context manager: the `with` block gets the path of a temporary folder, which becomes `path` when the block ends
     and is deleted if the block fails.
 
-    If another process has made the folder `path` in the meantime, that folder stays and the temporary folder is
+    If another process has created the folder `path` in the meantime, that folder stays and the temporary folder is
     deleted.
     """
     partial = _partial(path)
@@ -86,8 +86,8 @@ def write_text(path: str | Path, content: str) -> None:
 
 @contextmanager
 def arrays(path: str | Path) -> Iterator[Any]:
-    """The arrays of an .npz file, by name. Raises `ValueError` for other files, because NumPy's message would suggest
-    unpickling."""
+    """The arrays of an .npz file, by name. For other files, this function raises its own `ValueError`, because NumPy's
+    error message would suggest unpickling."""
     import numpy as np
 
     with Path(path).open("rb") as file:

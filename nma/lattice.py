@@ -7,13 +7,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# For each number of dimensions d, the positive root of x^(d+1) = x + 1.
+# _ROOTS maps each number of dimensions d to the positive root of x^(d+1) = x + 1.
 _ROOTS = {2: 1.324717957244746, 3: 1.2207440846057596, 4: 1.1673039782614187}
 
 
 def lattice_steps(dimensions: int) -> tuple[float, ...]:
-    """The step from one point of the lattice to the next, modulo 1. The components are powers of 1 / root, where the
-    root is in `_ROOTS`."""
+    """The step from one point of the lattice to the next, modulo 1. Component k = 0, 1, ... is root^-(k + 1), with the
+    root from `_ROOTS`."""
     return tuple(_ROOTS[dimensions] ** -(k + 1) for k in range(dimensions))
 
 

@@ -14,7 +14,8 @@ from nma import ops
 from nma.errors import NmaError
 from nma.ops import Float
 
-# `init` sets a hidden layer near the identity to the identity plus this factor times the random matrix of He 2015.
+# `init` sets a layer with as many inputs as outputs to the identity plus this factor times the random matrix of He
+# 2015.
 _MIXING = 0.25
 
 # The largest depth and width of a network. A renderer could not run larger networks at every shading point.
@@ -65,8 +66,8 @@ def forward_lanes(
 
     The network is unrolled into the kernel, with its weights as literals. In the virtual functions of a renderer,
     reading the weights from memory, as `drjit.nn` does, would take ten times as long on LLVM, because the weights would
-    be gathered lane by lane. A packet without any `active` lane skips the network and returns zeros. The skip saves
-    time, because in a scene with only one BSDF, a renderer calls this BSDF even for rays that hit nothing.
+    be gathered lane by lane. A SIMD packet without any `active` lane skips the network and returns zeros. The skip
+    saves time, because in a scene with only one BSDF, a renderer calls this BSDF even for rays that hit nothing.
     """
     import drjit as dr
 
@@ -119,9 +120,9 @@ def _by_neuron(
 def _in_blocks(
     matrix: list[list[float]], bias: list[float], x: Sequence[Float], activation: _Activation
 ) -> list[Float]:
-    """Computes a layer in blocks of neurons. The sums of a block stay in registers while the inputs are added one by
-    one, so every input is loaded once per block. Dr.Jit may reorder operations, but it keeps the order of scopes. A new
-    scope for each input therefore keeps the inputs in order.
+    """Computes a layer in blocks of neurons. The sums of a block stay in registers while the inputs are processed one
+    by one, so every input is loaded once per block. Each input gets a new scope, because Dr.Jit may reorder operations
+    within a scope, but it keeps the order of scopes.
     """
     import drjit as dr
 

@@ -1,6 +1,6 @@
 """Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written only once (CONVENTIONS.md).
 
-A function chooses the array package by the types of its arguments. For plain Python numbers, the result is a plain
+Each function chooses the array package by the types of its arguments. For plain Python numbers, the result is a plain
 Python number. Code that uses this module must call `select` instead of branching on values. A `Vec3` is a triple of
 arrays: a direction or an RGB colour.
 """
@@ -148,7 +148,7 @@ def select(condition: Mask, a: Float, b: Float) -> Float:
 
 
 def copysign(magnitude: Float, sign: Float) -> Float:
-    """The absolute value of `magnitude`, negative where `sign` < 0."""
+    """The absolute value of `magnitude`, multiplied by -1 where `sign` < 0."""
     return select(sign < 0, -absolute(magnitude), absolute(magnitude))
 
 

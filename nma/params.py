@@ -1,8 +1,8 @@
 """Declares the parameters of classes of materials. Training, rendering, the command line and the exports read these
 declarations.
 
-This file declares `layered3` and the classes without a source. A class that is added later declares its parameters in
-the file of its source. `nma.sources.space` finds the parameters of every class.
+This file declares `layered3` and the classes without a source. Every other class declares its parameters in the file of
+its source. `nma.sources.space` finds the parameters of every class.
 """
 
 from __future__ import annotations

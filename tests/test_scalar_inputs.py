@@ -288,7 +288,7 @@ def test_a_wrong_input_is_refused_with_its_name(bitmap, tmp_path):
         ),
         (
             {"eta_top": png(tmp_path, True)},
-            'its pixels are bytes, 0 to 1; with `format` "variant" a bitmap keeps',
+            'the pixels are stored as bytes, which hold only 0 to 1; with `format` "variant" a bitmap keeps',
         ),
     ]
     bsdfs = [

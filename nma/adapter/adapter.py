@@ -124,8 +124,8 @@ class Adapter:
 
     @property
     def reciprocal(self) -> bool:
-        """Whether f stays the same when wi and wo are swapped, that is, whether the target's parameters do not depend
-        on wi."""
+        """Whether the BRDF f stays the same when wi and wo are swapped, that is, whether the target's parameters do not
+        depend on wi."""
         return not (self.directional or self.bounded)
 
     @property

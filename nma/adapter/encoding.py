@@ -1,4 +1,5 @@
-"""Encodings of the network's inputs: a class's parameters and the view direction as numbers of about unit size.
+"""Encodings of the network's inputs: each encoding converts a class's parameters and the view direction to numbers of
+about unit size.
 
 Encodings are written with `nma.ops`, so training and rendering run the same code. Weights files store the name of the
 encoding.

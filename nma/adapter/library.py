@@ -100,8 +100,8 @@ class Library:
         return (shares / shares.sum() @ codes).astype(np.float32)
 
     def material(self, code: ArrayLike, name: str | None = None) -> Adapter:
-        """An adapter of a single material: the material that the code describes. Its network reads only cos(theta_i),
-        because the contribution of the code to the first layer is added to the biases of that layer."""
+        """An adapter of a single material: the material that the code describes. The adapter's network reads only
+        cos(theta_i), because the contribution of the code to the first layer is added to the biases of that layer."""
         code = LIBRARY.check(code)
         if len(code) != 1:
             raise ParamError(f"`material` takes one code; got {len(code)} codes")

@@ -20,8 +20,8 @@ from nma.render import register as _plugins
 
 __all__ = ["use"]
 
-# Mitsuba loads Dr.Jit, which then looks for libLLVM, so libLLVM must be chosen first. Without libLLVM, scalar_rgb and
-# the CUDA variants still work.
+# Mitsuba loads Dr.Jit, which then looks for libLLVM, so libLLVM must be chosen before Mitsuba is imported. Without
+# libLLVM, scalar_rgb and the CUDA variants still work.
 with contextlib.suppress(MissingDependencyError):
     ensure_llvm()
 _plugins.register()

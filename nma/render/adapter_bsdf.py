@@ -1,9 +1,10 @@
 """Mitsuba 3 BSDF `nma`: a material that its adapter evaluates as a blend of Principled BRDFs.
 
 The network maps the material's parameters and the view direction to the parameters of the blend, which is then
-evaluated and sampled. Without textures the network runs only when the scene is loaded, and the blend's parameters are
-stored as curves over cos(theta_i). With textures, and for anisotropic adapters, the network runs once per shading
-point. `nma.render.inputs` reads the material's parameters. The BSDF is one-sided; wrap it in `twosided` if needed.
+evaluated and sampled. Without textures the network runs only when the scene is loaded or edited, and the blend's
+parameters are stored as curves over cos(theta_i). With textures, and for anisotropic adapters, the network runs once
+per shading point. `nma.render.inputs` reads the material's parameters. The BSDF is one-sided; wrap it in `twosided` if
+needed.
 
 The property `adapter` is the name of a shipped adapter or a weights file. With `clamp`, parameters outside the
 adapter's training range are clamped to that range instead of rejected. Further properties are the parameters of the
@@ -56,7 +57,7 @@ def define() -> type:
         def parameters_changed(self, keys: Any = ()) -> None:
             try:
                 super().parameters_changed(keys)
-            finally:  # also after an error, because only the invalid edits are undone
+            finally:  # after an error, too, because only the invalid edits are undone
                 if self._curves is not None:
                     self._curves.update(self.inputs.columns())
 

@@ -115,7 +115,8 @@ def define_base() -> type:
 
 
 def mean_of_samples(draw: Callable[[Any, Any, Any, Any], Color], points: int, active: Any = True) -> Color:
-    """The mean of draw(k, u1, u2, u3) over the points k = 0, 1, ..., points - 1 of the unit cube.
+    """The mean of draw(k, u1, u2, u3) over points (u1, u2, u3) of a lattice in the unit cube, with the indices k = 0,
+    1, ..., points - 1.
 
     All lanes use the same points, so the mean has a small error, but no noise.
     """

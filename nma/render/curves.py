@@ -14,7 +14,7 @@ from nma.target.decode import numbers
 
 # The number of nodes, that is, of cosines for which the blend is stored. For random materials in the training range,
 # the curves changed BRDF values by 1e-4 on average, at directions sampled from the blend, and albedos by 1e-5. Nodes
-# that lie closer at grazing angles gave about the same errors.
+# that lie closer together at grazing angles gave about the same errors.
 NODES = 128
 # The count of numbers that one gather fetches. Dr.Jit can fetch a block of numbers at once if the length of the block
 # is a power of two, so 24 numbers need three gathers of 8.
@@ -73,7 +73,8 @@ class Curves:
         return self.adapter.from_numbers(flat, wi)
 
     def _tabulated(self, columns: Sequence[Float]) -> Float:
-        """The numbers of all nodes, one node after another, each padded with zeros to whole packets."""
+        """The numbers of all nodes, one node after another. The numbers of each node are padded with zeros to whole
+        packets."""
         cosines = dr.maximum(dr.linspace(_mitsuba().Float, 0.0, 1.0, self.nodes), MIN_COS)
         made = _prepare(self.adapter, self.layers, columns, at_azimuth_0(cosines))
         flat = numbers(made.blend, self.adapter.target)

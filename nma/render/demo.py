@@ -203,7 +203,8 @@ def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[
 def _measured(
     scene: Scene, first: dict[str, Frame], settings: Settings, progress: Progress
 ) -> tuple[NDArray[np.float32], list[Line]]:
-    """Returns the reference picture, which is rendered with other random seeds, and the table's line for each BSDF."""
+    """Returns the reference picture, which has other random seeds than the measured frames, and the table's line for
+    each BSDF."""
     truth = render_passes(
         _load(scene.bsdfs["layered"], settings),
         settings.reference_spp,

@@ -53,7 +53,10 @@ def check_texture(allowed: Allowed, texture: Any, leaves: list[Any], channel: in
         except TextureError as error:
             if pixels.dtype != np.uint8:
                 raise
-            hint = 'its pixels are bytes, 0 to 1; with `format` "variant" a bitmap keeps floats, which can be edited'
+            hint = (
+                "the pixels are stored as bytes, which hold only 0 to 1; "
+                'with `format` "variant" a bitmap keeps floats, which can be edited'
+            )
             raise TextureError(f"{error}; {hint}") from None
 
 

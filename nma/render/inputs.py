@@ -46,8 +46,8 @@ class Inputs:
         missing = [param.name for param in space.params if param.name not in given]
         if missing:
             raise ParamError(
-                f"class {space.name}: no value for {', '.join(missing)}; give each a number, a colour or a texture, "
-                "or name a `material` that has them (`nma materials` lists the shipped materials)"
+                f"class {space.name}: no value for {', '.join(missing)}; give each parameter a number, a colour "
+                "or a texture, or name a `material` that has them (`nma materials` lists the shipped materials)"
             )
         self.values = {param.name: _value(param, given[param.name]) for param in space.params}
         self.chosen = {param.name: _channel(param, props, self.values[param.name]) for param in space.params}
@@ -100,8 +100,8 @@ class Inputs:
         of other scenes.
 
         BSDFs call this method wherever they use inputs, because Mitsuba does not report edits of a texture that several
-        BSDFs share. While Dr.Jit freezes a function, values cannot be read, so edited values are clamped to the bounds
-        instead.
+        BSDFs share. While Dr.Jit records a frozen function, values cannot be read, so edited values are clamped to the
+        bounds instead.
         """
         import drjit as dr
 
@@ -215,7 +215,7 @@ class _Seen:
 
 
 def _known(key: str) -> bool:
-    """Whether `key`, a key of `mi.traverse`, is that of the pixels or of the value of a texture."""
+    """Whether `key` is a key of `mi.traverse` for the pixels or the value of a texture."""
     return key.rpartition(".")[2] in ("data", "value")
 
 

@@ -47,8 +47,8 @@ class Softbox(NamedTuple):
     radiance: Colour
 
     def coverage(self, direction: Array) -> Array:
-        """The share of the light's radiance in each of the directions (..., 3): 1 inside the rectangle, 0 outside, and
-        smooth between."""
+        """The fraction of the light's radiance in each of the directions (..., 3): 1 inside the rectangle, 0 outside,
+        and a smooth step between."""
         middle = np.array(self.towards) / np.linalg.norm(self.towards)
         right = np.cross(middle, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
@@ -56,7 +56,7 @@ class Softbox(NamedTuple):
         across = np.cos(turn) * right + np.sin(turn) * np.cross(right, middle)
         along = np.cross(across, middle)
 
-        # Project onto the plane that touches the sphere at the middle.
+        # Project the directions onto the tangent plane of the unit sphere at `middle`.
         depth = direction @ middle
         place = np.stack([direction @ across, direction @ along], -1) / np.maximum(depth, 1e-3)[..., None]
         angle = np.degrees(np.arctan(np.abs(place)))
@@ -75,11 +75,11 @@ SOFTBOXES = (
     Softbox((-0.85, 0.50, 0.25), (1.8, 18.0), 1.0, 0.0, (8.8, 8.8, 8.8)),  # a strip behind, on the left
 )
 HORIZON, ZENITH = (0.038, 0.038, 0.041), (0.20, 0.22, 0.255)
-SKY_RISE = 0.55  # sine of the elevation from which on the dome is as bright as at the zenith
+SKY_RISE = 0.55  # sine of the elevation above which the dome is as bright as at the zenith
 
 
 def emitters(lighting: str, hide_sun: bool = False) -> dict[str, Any]:
-    """The lights of the lighting with this name. The result maps keys of the scene's dictionary to Mitsuba
+    """The emitters of the lighting with this name. The result maps keys of the scene's dictionary to Mitsuba
     dictionaries.
 
     Raises:
@@ -132,8 +132,8 @@ def sky_radiance(sun_scale: float = SUN_SCALE, height: int = 512) -> NDArray[np.
 
     Because Mitsuba importance-samples the pixels of an image, a scene with only the floor has 51 times less variance
     per sample than with the emitter `sunsky`. Mitsuba's model is black below the horizon. Just below the horizon, this
-    image fades into the floor's colour. Further down the image stays black, because the floor hides that part and black
-    pixels get no samples.
+    image fades into the floor's colour. Further down, the image stays black, because the floor hides that part, and
+    because black pixels get no samples.
     """
     import drjit as dr
     import mitsuba as mi

@@ -32,7 +32,7 @@ def material_bsdf(
     """The Mitsuba dictionary of a material.
 
     Args:
-        material: returned by `nma.materials.load`. The textures of the material are read and checked here.
+        material: returned by `nma.materials.load`. This function reads and checks the material's textures.
         model: "nma" (the adapter) or "layered" (the reference).
         adapter: name of a shipped adapter or a weights file, for "nma".
         clamp: whether parameters outside the adapter's training range are clamped to that range instead of rejected.

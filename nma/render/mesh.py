@@ -76,8 +76,9 @@ def _load(description: dict[str, Any], path: str | Path) -> Any:
     import mitsuba as mi
 
     try:
-        # When Mitsuba computes normals, it fails without triangles, and writes out of bounds for wrong vertex indices.
-        # Therefore, the faces are checked first, on a mesh with `face_normals`, for which Mitsuba computes no normals.
+        # When Mitsuba computes the normals of a mesh, Mitsuba fails if there are no triangles, and writes out of bounds
+        # if a vertex index is wrong. Therefore, the faces are checked first, on a mesh with `face_normals`, for which
+        # Mitsuba computes no normals.
         _check_faces(mi.load_dict(description | {"face_normals": True}), path)
         return mi.load_dict(description)
     except RuntimeError as error:

@@ -90,15 +90,16 @@ def _worn_metal(rng: np.random.Generator, size: int) -> Array:
 
 
 def _finger_prints(rng: np.random.Generator, size: int, count: int = 5) -> Array:
-    """Ridges (size, size) in 0..1: soft ovals at random places, filled with concentric ovals bent by noise."""
+    """The ridges of fingerprints (size, size) in 0..1: soft ovals at random places, filled with concentric ovals that
+    noise bends."""
     x, y = np.meshgrid((np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size)
     bend = periodic_noise(rng, size, period=0.25, slope=3.0)
     prints = np.zeros((size, size))
     for _ in range(count):
         cx, cy, turn, scale = *rng.uniform(size=2), rng.uniform(0.0, np.pi), rng.uniform(0.085, 0.12)
 
-        # Distances are measured to the nearest copy of the centre, so that a print continues across the border of the
-        # tile.
+        # Distances are measured to the nearest copy of the centre, so that a fingerprint continues across the border of
+        # the tile.
         dx, dy = (x - cx + 0.5) % 1.0 - 0.5, (y - cy + 0.5) % 1.0 - 0.5
         along, across = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
         oval = np.hypot(along / 1.45, across) / scale

@@ -45,8 +45,8 @@ def bounded(blend: Blend, cos_theta_i: Float) -> Blend:
     Channels whose bound is below 1 do not change. Use this function only if the parameters of the blend depend on the
     view direction, because a blend of constant parameters would lose its reciprocity.
     """
-    # Below the horizon, where nothing is reflected, the bound is computed for normal incidence, because its formula
-    # might divide by zero.
+    # Below the horizon, where nothing is reflected, the bound is computed for normal incidence instead, because the
+    # formula of the bound might divide by zero.
     cosine = ops.select(cos_theta_i > MIN_COS, cos_theta_i, 1.0)
     total = Color(0.0, 0.0, 0.0)
     for p, weight in zip(blend.instances, blend.weights, strict=True):

@@ -1,7 +1,7 @@
 """Converts between three forms of a blend: raw network outputs, a `Blend`, and a flat list of numbers.
 
-All lists have the same order: the parameters of instance 1, of instance 2, and so on, then the weights of the blend.
-The parameters' ranges are stored in weights files.
+All lists have the same order: the parameters of instance 1, of instance 2, and so on, then all weights of the blend
+except the last. The parameters' ranges are stored in weights files.
 """
 
 from __future__ import annotations
@@ -128,7 +128,9 @@ def _check(p: TargetParam) -> None:
     """Raises `WeightsError` for a parameter that `Principled` does not have, or a range on which it is not defined."""
     size = 3 if p.name == "base_color" else 1
     if p.name not in Principled._fields or type(p.size) is not int or p.size != size:
-        raise WeightsError(f"Target parameter {p} has a wrong name or size; names are {Principled._fields}.")
+        raise WeightsError(
+            f"Target parameter {p} has a wrong name or size; allowed names are {Principled._fields}."
+        )
     if type(p.in_plane) is not bool or (p.in_plane and p.name != "anisotropic"):
         raise WeightsError(f"Target parameter {p} cannot be `in_plane`; only `anisotropic` can.")
     if type(p.low) not in (int, float) or type(p.high) not in (int, float):
@@ -169,8 +171,8 @@ def decode(
 ) -> Blend:
     """Converts raw network outputs, `output_size` of them, to a blend.
 
-    The weights come from stick-breaking, that is, each weight is a share of what the previous weights leave of 1, and
-    the last weight is the remainder. `cos_theta_i` is used for parameters that are `in_plane`.
+    The weights come from stick-breaking: each weight is a fraction of the remainder that the previous weights leave of
+    1, and the last weight is the final remainder. `cos_theta_i` is used for parameters that are `in_plane`.
     """
     size = instance_size(params)
     instances = tuple(
@@ -220,7 +222,7 @@ def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPL
     n = (len(flat) + 1) // (size + 1)
     if n < 1 or len(flat) != output_size(n, params):
         raise WeightsError(
-            f"{len(flat)} numbers describe no blend: n instances need {size} numbers each, and n - 1 weights."
+            f"{len(flat)} numbers do not describe a blend: n instances need {size} numbers each, and n - 1 weights."
         )
     instances = tuple(_instance(flat[k * size : (k + 1) * size], params) for k in range(n))
     weights = tuple(flat[n * size :])

@@ -233,10 +233,9 @@ private:
         std::string place =
             texels.pixels() > 1 ? tfm::format(" at x=%zu, y=%zu", pixel % texels.width, pixel / texels.width) : "";
         if (bad > 1) place += tfm::format(", the first of %zu such pixels", bad);
-        const char* hint =
-            texels.bytes
-                ? "; its pixels are bytes, 0 to 1; with `format` \"variant\" a bitmap keeps floats, which can be edited"
-                : "";
+        const char* hint = texels.bytes ? "; the pixels are stored as bytes, which hold only 0 to 1; with `format` "
+                                          "\"variant\" a bitmap keeps floats, which can be edited"
+                                        : "";
         Throw("the texture of %s%s: %s%s", p.name, place, refusal(p, found), hint);
     }
 
