@@ -91,7 +91,9 @@ def encode(
     path: _Library,
     source: Annotated[Path, typer.Argument(help="A file with the values of the new material.")],
     output: Annotated[Path, options.output("The library to write, with one more material.", ".safetensors")],
-    material: Annotated[str | None, typer.Option(help="Which material, if the file holds several.")] = None,
+    material: Annotated[
+        str | None, typer.Option(help="Which material, if the file contains several.")
+    ] = None,
     name: Annotated[
         str | None,
         typer.Option(help="The name of the new material; by default --material, or the name of the file."),
