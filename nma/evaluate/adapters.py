@@ -19,9 +19,9 @@ from nma.table import ISOTROPIC, Grid, Tables, quadrature
 from nma.table.grid import check_class
 from nma.table.walks import bin_index
 
-# A row of the table is a bin of cos(theta_i). The network runs at _DIRECTIONS cosines in each row. At each of these
-# cosines the target is evaluated for _POINTS directions wo in each bin of wo, and for _SAMPLES directions wo drawn from
-# the target's own lobes.
+# A row of the table is a bin of cos(theta_i). In each row, the network runs at _DIRECTIONS cosines. At each cosine, the
+# target is evaluated for _POINTS directions wo in each bin of wo, and for _SAMPLES directions wo drawn from the
+# target's own lobes.
 _DIRECTIONS = 32
 _POINTS = 4
 _SAMPLES = 512

@@ -2,7 +2,7 @@
 
 cos(theta_i) and cos(theta_o) are independent and uniform in the range `cosines`; azimuths are uniform. The comparison
 needs no bins, so the sources may be anisotropic, and it does not matter on which data a model was trained. The error
-figures of adapters for single materials are computed in this way.
+figures of adapters for single materials are computed at random pairs of directions.
 """
 
 from __future__ import annotations

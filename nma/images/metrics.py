@@ -172,8 +172,8 @@ def _ssim(a: Image, b: Image) -> float:
 def _exposures(reference: Image) -> dict[str, float]:
     """The range of exposures for HDR-FLIP. If the result is empty, the package flip_evaluator chooses the range.
 
-    The package would end the process for a reference that is black or of one colour, so for such a reference the range
-    is a single exposure.
+    For a reference that is black or of one colour, flip_evaluator would end the process, so the range is a single
+    exposure for such a reference.
     """
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
     brightest, middle = float(luminance.max()), float(np.median(luminance))

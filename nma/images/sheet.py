@@ -196,7 +196,7 @@ def _width(text: str, size: int, *, bold: bool = False) -> int:
 
 @lru_cache(maxsize=16)
 def _font(size: int, bold: bool) -> ImageFont.FreeTypeFont:
-    """The font DejaVu Sans. Matplotlib's files contain this font, so it need not be installed on the system."""
+    """Loads the font DejaVu Sans. Matplotlib's files contain the font, so it need not be installed on the system."""
     import matplotlib
 
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"

@@ -10,8 +10,8 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-# The most pixels that an image may have: 16384 x 8192, as in the largest common environment maps. An image of this size
-# takes 2 GiB as RGBA in 32-bit floats.
+# The most pixels that an image may have: 16384 x 8192, as in the largest common environment maps. An image of 16384 x
+# 8192 pixels takes 2 GiB as RGBA in 32-bit floats.
 MOST_PIXELS = 1 << 27
 
 _START = 1 << 16  # bytes read at the start of a file, enough for every header

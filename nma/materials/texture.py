@@ -126,7 +126,7 @@ def _bitmap(path: Path) -> Any:
 def is_coloured(rgb: NDArray[np.float32]) -> bool:
     """Whether any pixel is coloured, which means that its channels differ by more than rounding explains.
 
-    The limit is `ROUNDING`, or `ROUNDING` times the pixel's red value if this value is above 1.
+    The limit is `ROUNDING`, or `ROUNDING` times the pixel's red value if the red value is above 1.
     """
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)

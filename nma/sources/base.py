@@ -73,8 +73,8 @@ class Values(Protocol):
 
     `name` is the model's name in messages. `isotropic` is true if the value stays the same when both directions are
     rotated about the normal by the same angle. An isotropic model may still have different values for a pair of
-    directions and for the mirror image of the pair. A bin of an isotropic table covers both pairs, so the bin's value
-    is the mean of the two values.
+    directions and for the mirror image of the pair. An isotropic table has the same bin for a pair and its mirror
+    image, and the bin's value is the mean over both.
     """
 
     @property

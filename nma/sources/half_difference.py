@@ -39,7 +39,7 @@ def angles(light: Vec3, view: Vec3) -> tuple[Float, Float, Float]:
 
 
 def directions(theta_h: Float, theta_d: Float, phi_d: Float) -> tuple[Vec3, Vec3]:
-    """The directions (light, view) that have these angles [rad] and a half vector at azimuth 0.
+    """The directions (light, view) of given angles [rad] whose half vector is at azimuth 0.
 
     Either direction may lie below the surface.
     """

@@ -24,11 +24,11 @@ from nma.ops import Color, Float, Vec3
 from nma.params import LAYERED3
 from nma.sources.base import Random, Walk
 
-# Russian roulette begins when the brightest channel of a walk's throughput falls below this threshold. Of the
-# thresholds tried, .5 had the smallest product of variance and time.
+# Russian roulette begins when the brightest channel of a walk's throughput falls below `ROULETTE_THRESHOLD`. The value
+# .5 had the smallest product of variance and time among the thresholds that were tried.
 ROULETTE_THRESHOLD = 0.5
-# The largest probability with which a walk survives total internal reflection. With probability 1, some walks between a
-# smooth coat and a perfect mirror, without a medium, would never end.
+# The largest probability with which a walk survives total internal reflection. If every walk survived, some walks
+# between a smooth coat and a perfect mirror, without a medium, would never end.
 TRAPPED_SURVIVAL = 0.999
 
 
@@ -83,7 +83,7 @@ class Layered3:
         height = walk.height + d.z * (optical_depth / dr.maximum(params.sigma_t, 1e-20))
         in_medium = walk.inside & (params.sigma_t > 0) & (height > 0) & (height < 1)
 
-        # At an interface, work in a frame whose normal points to the side the walk comes from.
+        # At an interface, work in a frame whose normal points to the side that the walk comes from.
         alpha = dr.select(at_bottom, params.alpha_bottom, params.alpha_top)
         w = Vec3(-d.x, -d.y, dr.maximum(dr.abs(d.z), 1e-7))
         m = sample_visible_normal(w, alpha, alpha, u1, u2)

@@ -2,8 +2,9 @@
 
 A renderer needs the value at a single pair of directions (wi, wo), but a random walk from wi leaves along a given wo
 with probability 0. So this module starts one walk from wi and another walk from wo, and joins the two walks into one
-path (bidirectional path sampling). The event at which the walks are joined is called the connection. Both directions of
-this event are known, so its density is evaluated, while all other events of the path are drawn at random.
+path (bidirectional path sampling). The event at which the walks are joined is called the connection. Both directions at
+the connection are known, so the density of the connection is evaluated, while all other events of the path are drawn at
+random.
 
 The light from wi to wo is split into three kinds:
 
@@ -11,9 +12,9 @@ The light from wi to wo is split into three kinds:
 - Light that is refracted into the coat and never scatters in the medium (`_unscattered`).
 - Light that is refracted into the coat and scatters in the medium at least once (`_scattered`).
 
-A connection at a narrow lobe gives a noisy estimate, because directions that were drawn independently seldom fit the
-lobe. So `_unscattered` prefers connections at wide lobes, and `_scattered` connects walks only in the medium, which
-scatters into all directions (compare Guo, Hasan and Zhao 2018, section 5).
+A connection at a narrow lobe gives a noisy estimate, because two directions that were drawn independently seldom lie in
+the same narrow lobe. So `_unscattered` prefers connections at wide lobes, and `_scattered` connects walks only in the
+medium, which scatters into all directions (compare Guo, Hasan and Zhao 2018, section 5).
 
 Throughputs count particles, as in the random walk of `nma.sources.layered`. So, unlike radiance, a throughput does not
 change by the squared index of refraction when a walk enters the coat.
@@ -64,9 +65,9 @@ def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True)
     forward, _ = _unscattered(stack, wi, there, wo, back, rng, True)
     backward, detour = _unscattered(stack, wo, back, wi, there, rng, False)
     scattered = _scattered(stack, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
-    # Walks from wo estimate f cos(theta_i). Since f is reciprocal, this estimate times cos(theta_o) / cos(theta_i) is
-    # an estimate of f cos(theta_o). `scattered` is an estimate below the coat. When light leaves the coat, its radiance
-    # is divided by the squared index of refraction, so `scattered` is divided by the squared index, too.
+    # `backward` estimates f cos(theta_i), because its walks start from wo. Since f is reciprocal, `backward` times
+    # cos(theta_o) / cos(theta_i) is an estimate of f cos(theta_o). When light leaves the coat, its radiance is divided
+    # by the squared index of refraction. `scattered` does not contain this factor, so the factor is applied here.
     index2 = stack.eta_top * stack.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(stack, wi, wo)
@@ -151,14 +152,13 @@ def _unscattered(
       towards wo.
     - Connection at the exit: the walk is reflected in a random direction, and the coat refracts the light along wo.
 
-    If `forward` is false, the caller has exchanged wi and wo. The connections of this second call are then at the
-    path's first hit and at its entrance. If a path has a single hit, the first hit is also the last hit, so only the
-    first call connects at this hit.
+    If `forward` is false, the caller has exchanged wi and wo. The connections are then at the path's first hit and at
+    its entrance. If a path has a single hit, the first hit is also the last hit, so only the first call connects at
+    this hit.
 
-    The balance heuristic (Veach 1997, eq. 9.8) weights the connections of a path by the density of sampling the path
-    with each connection. All events except the connection are sampled, so this density is that of the whole path
-    divided by the density of the connection. So the weight of a connection is proportional to its bluntness, which is
-    the reciprocal of its density.
+    The balance heuristic (Veach 1997, eq. 9.8) weights each possible connection of a path by the density of sampling
+    all other events of the path. This density is proportional to the reciprocal of the connection's own density, which
+    the code calls the connection's bluntness.
     """
     source, clear = Layered3(), replace(stack, sigma_t=stack.sigma_t * 0.0)
     drawn_up = -Vec3(*back.direction)
@@ -169,8 +169,8 @@ def _unscattered(
     def visit(before: Walk, after: Walk, first: Float) -> tuple[Color, Float]:
         """Estimates the light of the two connections at one hit of the conductor.
 
-        `before` is the walk before this hit, and `after` the walk after it. `first` is the bluntness of the walk's
-        first hit, or 0 if this hit is the first. Returns the estimate, and the bluntness of the first hit.
+        `before` is the walk before the hit, and `after` is the walk after the hit. `first` is the bluntness of the
+        walk's first hit, or 0 if there was no hit before. Returns the estimate, and the bluntness of the first hit.
         """
         w_in, went_up = -Vec3(*before.direction), Vec3(*after.direction)
         rest = way_in + first
@@ -220,7 +220,7 @@ def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: R
         out = Color.of(0.0)
         for d, reached in ways:
             # The segment began at the coat if `d` points down, else at the conductor. The light travels against `d`,
-            # from the point where it scatters to that interface.
+            # from the point where it scatters to the interface where the segment began.
             depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
             out = out + reached * (_transmittance(stack, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
         found = throughput(walk) * Color(*stack.albedo) * out * _ISOTROPIC_PHASE
@@ -304,8 +304,8 @@ def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     fresnel, cos_t = fresnel_dielectric(cos_i, eta)
     crossing = stack.alpha_top * (eta * cos_t - cos_i) / (2.0 * eta * cos_t)
     width2 = stack.alpha_bottom * stack.alpha_bottom + 2.0 * crossing * crossing
-    # Beyond the critical angle, the coat reflects light of the conductor's lobe back down. Such light may later leave
-    # in any direction, so it increases the weight of the cosine lobe.
+    # Beyond the critical angle, the coat reflects light of the conductor's lobe back down. The light may later leave in
+    # any direction, so it increases the weight of the cosine lobe.
     critical = 1.0 / (eta + ops.safe_sqrt(eta * eta - 1.0))
     trapped = width2 / (width2 + critical * critical)
     metal = _mean(fresnel_conductor_rgb(cos_t, Color(*stack.eta_bottom), Color(*stack.k_bottom)))

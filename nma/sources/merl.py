@@ -46,7 +46,7 @@ class Merl:
     `planes` (3, 90, 90, 180) float64 are the numbers of the file, with the axes channel, theta_h, theta_d and phi_d.
 
     The database's own reader rounds angles down to the index of an entry, so for this reader an entry applies to a
-    whole cell of the grid. Here an entry is the value at the middle of its cell. Between the middles, `eval`
+    whole cell of the grid. In this class, an entry is the value at the middle of its cell. Between the middles, `eval`
     interpolates linearly, from measured entries only.
     """
 

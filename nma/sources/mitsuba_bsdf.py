@@ -22,12 +22,13 @@ from nma.sources import rgl
 from nma.sources.base import direction
 from nma.sources.files import Format
 
-# A BSDF is tested for isotropy at this many pairs of directions. Relative changes up to `_ROUNDING` are taken for
+# A BSDF is tested for isotropy at `_PAIRS` pairs of directions. Relative changes up to `_ROUNDING` are taken for
 # rounding errors.
 _PAIRS = 512
 _ROUNDING = 1e-3
-# A direction whose cosine is below `_MIN_COS` is raised to this cosine. Otherwise Mitsuba's measured and rough BSDFs
-# would return NaN for two opposite directions at the horizon, whose half vector is imprecise in single precision.
+# A direction whose cosine is below `_MIN_COS` is raised to the cosine `_MIN_COS`. With smaller cosines, Mitsuba's
+# measured and rough BSDFs would return NaN for two opposite directions at the horizon, whose half vector is imprecise
+# in single precision.
 _MIN_COS = 1e-6
 
 

@@ -15,8 +15,8 @@ from nma.sources.base import Values
 from nma.table.grid import Tables, kept
 from nma.table.values import tabulate_values
 
-# The name of a table's file contains this many digits of the SHA-256 of the material's file. If the material's file
-# changes, the saved table is therefore no longer used.
+# The name of a table's file contains `_DIGEST` digits of the SHA-256 of the material's file, so a saved table is no
+# longer used if the material's file changes.
 _DIGEST = 12
 
 

@@ -59,7 +59,8 @@ class Settings:
         if self.population not in get_args(Population) or self.population == "unseen_metals":
             known = ", ".join(p for p in get_args(Population) if p != "unseen_metals")
             # With "unseen_metals", one call of `ParamSpace.sample` draws many materials, and every third of them has a
-            # metal held out for tests. A dataset calls `sample` once per material, so it cannot have this population.
+            # metal held out for tests. A dataset calls `sample` once per material, so it cannot have the population
+            # "unseen_metals".
             raise DatasetError(f"a dataset's population is one of {known}; got '{self.population}'")
 
 

@@ -25,18 +25,19 @@ from nma.table.grid import ISOTROPIC, Grid, Tables
 
 # The default number of points per bin. Bins near the mirror direction contain the peaks of smooth materials, so they
 # get `_NEAR` times as many points, with a density that increases towards the mirror direction. The additional points
-# cost little time, because such bins are few.
+# cost little time, because few bins are near the mirror direction.
 POINTS = 128
 _NEAR = 32
-# A bin counts as near the mirror direction if its theta_o is less than this many bins away from the mirror direction.
+# A bin counts as near the mirror direction if its theta_o is less than `_REACH` bins away from that direction.
 _REACH = 4.5
 
-# A bin's points are divided into this many independent sets. The spread of the sets' means gives the standard error.
+# A bin's points are divided into `_SETS` independent sets. The spread of the sets' means gives the standard error.
 _SETS = 4
-# The number of points must be a multiple of `_MULTIPLE`, so that all sets have equally many points, and the points of
-# each set form equally many pairs in both mirror halves of a bin.
+# The number of points must be a multiple of `_MULTIPLE`, so that all sets have equally many points, and each set has
+# equally many pairs of points in both mirror halves of a bin.
 _MULTIPLE = 16
-# Points stay this fraction of a bin's width away from its edges, so that rounding moves no point into the next bin.
+# Points keep a distance of `_EDGE` bin widths from the edges of the bin, so that rounding moves no point into the next
+# bin.
 _EDGE = 1e-5
 
 # If the variance of the weights is below `_UNWEIGHTED`, the weights count as equal, because only rounding makes them
@@ -187,9 +188,9 @@ def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:
 class TableValues:
     """A table as a source (`Values`): every pair of directions has the value of its bin.
 
-    `tabulate_values` of such a source gives the same table again. With `smooth`, values are interpolated linearly
-    between the middles of the bins. Interpolation avoids steps in rendered images, but it widens peaks and changes the
-    means over bins.
+    Without `smooth`, `tabulate_values` of this source returns the same table again. With `smooth`, values are
+    interpolated linearly between the middles of the bins. Interpolation avoids steps in rendered images, but it widens
+    peaks and changes the means over bins.
     """
 
     def __init__(self, tables: Tables, number: int = 0, *, name: str = "table", smooth: bool = False):

@@ -19,8 +19,8 @@ from nma.table.grid import ISOTROPIC, Grid, Tables
 
 # Throughputs are summed as integers in units of 2^-16, because an integer sum does not depend on the order of addition.
 _UNIT = 65536.0
-# The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1. Only three
-# quarters of these walks are allowed, because some throughputs may be above 1.
+# The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1. The limit is
+# three quarters of 65535, because some throughputs may be above 1.
 _WALKS_PER_ROW = 49151
 # The most bins of all materials in one kernel launch, which limits the memory and does not change the result.
 _BINS_PER_LAUNCH = 1 << 21

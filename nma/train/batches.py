@@ -19,7 +19,7 @@ from nma.table import ISOTROPIC, Grid, Tables
 from nma.table.dataset import Settings, simulate_block
 from nma.train.recipe import Recipe
 
-# A stream replaces this many materials at once, so that the simulation has enough walks to run in parallel.
+# A stream replaces `STREAM_BLOCK` materials at once, so that the simulation has enough walks to run in parallel.
 STREAM_BLOCK = 16
 
 
@@ -37,12 +37,12 @@ class Batch(NamedTuple):
     o: NDArray[np.float32]  # (bins_per_row, rows) index of the bin of cos(theta_o)
     p: NDArray[np.float32]  # (bins_per_row, rows) index of the bin of the azimuth of wo
     shift: NDArray[np.float32]  # (3 or 4, bins_per_row, rows) random shift of the points' lattice
-    weight: NDArray[np.float32]  # (bins_per_row, rows) mean 1, corrects for the uneven choice of bins
+    # (bins_per_row, rows) weights of mean 1 that correct for the uneven choice of bins
+    weight: NDArray[np.float32]
     value: NDArray[np.float32]  # (3, bins_per_row, rows) values of the table
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at `mu`
-    albedo_shift: NDArray[
-        np.float32
-    ]  # (3, 2, rows) random shifts of the samples that estimate the target's albedo
+    # (3, 2, rows) random shifts of the samples that estimate the target's albedo
+    albedo_shift: NDArray[np.float32]
     quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to the value of a bin
 
 

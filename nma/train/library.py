@@ -25,8 +25,8 @@ from nma.train.loss import bin_means, brdf_of, distance, loss
 from nma.train.recipe import Recipe
 from nma.train.run import adapter_of, initial_layers
 
-# With this recipe, a library of a hundred materials needs 20 minutes or less on two cores. This time includes the
-# tabulation of the materials.
+# With this recipe, a library of a hundred materials needs 20 minutes or less on two cores, including the tabulation of
+# the materials.
 RECIPE = Recipe(
     network="3x32",
     encoding="raw",
@@ -42,7 +42,7 @@ RECIPE = Recipe(
 # The recipe for finding the code of one new material. The network is fixed, so a thousand steps are enough.
 ENCODING = replace(RECIPE, learning_rate=3e-2, average=0.99, steps=1_000)
 
-# The search for a code starts at the codes of this many materials, and at the mean of all codes.
+# The search for a code starts at the codes of the `NEAREST` nearest materials, and at the mean of all codes.
 NEAREST = 3
 # Standard deviation of the codes before training.
 _SPREAD = 0.5
@@ -97,7 +97,7 @@ class Encoded:
     """The code (32,) of a new material, and its log loss over the bins of the table.
 
     `nearest` is the library's material whose code has the lowest log loss on the same table, and `nearest_log_loss` is
-    this log loss.
+    the log loss of its code.
     """
 
     code: NDArray[np.float32]

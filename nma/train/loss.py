@@ -20,7 +20,7 @@ from nma.target import Brdf
 from nma.train.batches import Batch
 from nma.train.recipe import Recipe
 
-# The Huber loss is quadratic for residuals of the logarithm up to this size, even in a bin with hardly any noise.
+# The Huber loss is quadratic for residuals of the logarithm up to `_TOLERANCE`, even in a bin with hardly any noise.
 _TOLERANCE = 0.003
 
 
@@ -96,7 +96,7 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     if not recipe.albedo > 0:
         return 0.0
     # The square of a noisy estimate's error would contain the variance of the estimate. The expected product of the
-    # errors of two independent estimates does not contain this variance.
+    # errors of two independent estimates does not contain the variance.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 

@@ -29,7 +29,7 @@ from nma.train.recipe import Recipe
 
 # Number of directions wi of the pool (its rows), and number of directions wo for each direction wi.
 ROWS, POINTS = 8192, 512
-# One of this many directions wo is drawn near the mirror direction; the other directions are uniform. A share of a
+# One of `_CROWDED` directions wo is drawn near the mirror direction; the other directions are uniform. A share of a
 # quarter is enough to find narrow lobes. A larger share would make the fit of smooth parts of the material worse.
 _CROWDED = 4
 # Widths (alpha) of the microfacet lobes from which the directions near the mirror direction are drawn.
@@ -45,12 +45,11 @@ class PointBatch(NamedTuple):
     mu: NDArray[np.float32]  # (rows,) cos(theta_i)
     phi: NDArray[np.float32]  # (rows,) azimuth of wi
     wo: NDArray[np.float32]  # (3, points, rows)
-    weight: NDArray[np.float32]  # (points, rows) mean 1, corrects for the uneven density of wo
+    weight: NDArray[np.float32]  # (points, rows) weights of mean 1 that correct for the uneven density of wo
     value: NDArray[np.float32]  # (3, points, rows)
     albedo: NDArray[np.float32]  # (3, rows) directional albedo at wi
-    albedo_shift: NDArray[
-        np.float32
-    ]  # (3, 2, rows) random shifts of the samples that estimate the target's albedo
+    # (3, 2, rows) random shifts of the samples that estimate the target's albedo
+    albedo_shift: NDArray[np.float32]
 
 
 @dataclass

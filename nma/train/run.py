@@ -63,8 +63,9 @@ def train_class(
     """Trains an adapter on tables of many materials. Returns the adapter and the run.
 
     `record` says where the tables come from and is stored with the weights. If `data` is `Settings` instead of tables,
-    materials are simulated during training. Then `data.materials` materials are in memory, and every `refresh` steps a
-    block of new materials replaces the oldest block. Raises `TableError` if the data is of another class than `space`.
+    materials are simulated during training. In this case `data.materials` materials are in memory, and every `refresh`
+    steps a block of new materials replaces the oldest block. Raises `TableError` if the data is of another class than
+    `space`.
     """
     check_class(data.class_name, space.name, "the adapter")
     sampler = BinSampler(recipe.bins_law, recipe.grid)
