@@ -265,6 +265,11 @@ def test_what_is_no_dataset_is_refused(tmp_path):
         ("nma_dataset", None, "is not a dataset of tables"),
         ("nma_dataset", {**SETTINGS.__dict__, "format": 99}, "has format 99"),
         ("nma_dataset", {**SETTINGS.__dict__, "colour": 1}, "is not a dataset of tables"),
+        (
+            "nma_dataset",
+            {**SETTINGS.__dict__, "class_name": "paint"},
+            "is of class 'paint'; this version simulates",
+        ),
         ("nma_params", "0123456789abcdef", "drew other parameters"),
     ],
 )

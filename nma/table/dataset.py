@@ -140,6 +140,11 @@ class Dataset:
             raise DatasetError(
                 f"{path} has format {settings.format}, but this version reads format {FORMAT}; make the dataset again"
             )
+        if settings.class_name not in sources.names():
+            raise DatasetError(
+                f"{path} is of class '{settings.class_name}'; this version simulates {', '.join(sources.names())}: use "
+                "the version that made it"
+            )
         if fingerprint != _fingerprint(settings):
             raise DatasetError(
                 f"{path} was made by a version that drew other parameters from the same seed; make the dataset again"
