@@ -128,7 +128,7 @@ def test_a_file_may_hold_values_beyond_the_training_range_of_adapters(material_f
         ("alpha_top = 0.1", f"alpha_top = [0x{'f' * 9000}, 1]", "too many digits, but must be a number"),
         ("alpha_top = 0.1", "alpha_top = inf", r"alpha_top is inf, allowed"),
         ("alpha_top = 0.1", "alpha_top = 1979-05-27", "must be a number"),
-        ("alpha_top = 0.1", f"alpha_top = {'[' * 9000}{']' * 9000}", "nest too deep"),
+        ("alpha_top = 0.1", f"alpha_top = {'[' * 9000}{']' * 9000}", "nested too deeply"),
         ("alpha_top = 0.1", f"alpha_top{'.a' * 2000} = 1", "unknown key 'a'"),
         ("alpha_top = 0.1", '"alpha\\ntop" = 1', r"unknown key 'alpha\\ntop'"),
         ("albedo = 0.5", 'albedo = { texture = "a\\u0000b.png" }', r"there is no texture .*a\\x00b.png"),

@@ -26,7 +26,7 @@ _DIRECTIONS = 32
 _POINTS = 4
 _SAMPLES = 512
 # The target's sampling density of wo [1/sr] at which half of f cos(theta_o) counts as sharp. Where the density is far
-# higher, a lobe is too narrow for a few points per bin, so samples of the lobe are used.
+# higher than `_SHARP`, a lobe is too narrow for a few points per bin, so samples of the lobe are used.
 _SHARP = 10.0
 
 
@@ -172,7 +172,7 @@ def evaluate(
 
     `progress` is called with the number of materials evaluated so far. Raises `TableError` if the tables have another
     class or another grid, and `ParamError` for materials outside the adapter's training range. With `clamp`, parameters
-    outside the training range are moved to the end of the range instead.
+    outside the training range are moved to the end of the range, and no `ParamError` is raised.
     """
     check_class(reference.class_name, adapter.space.name, "the adapter")
     if reference.values.shape[1:] != ISOTROPIC.shape:

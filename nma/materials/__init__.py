@@ -27,7 +27,7 @@ __all__ = ["Material", "Texture", "load", "names"]
 FOLDER = Path(__file__).parent
 HEADER = ("title", "description", "class", "uv_scale", "parameters")
 TEXTURE_OPTIONS = ("texture", "raw", "channel", "scale", "offset", "uv_scale")
-# A material file is about a page of text, so a file with more bytes than this is rejected.
+# A material file is about a page of text, so a file with more than `MAX_BYTES` is rejected.
 MAX_BYTES = 1 << 20
 
 _BARE_POINT = re.compile(r"[=\[,]\s*[-+]?\.\d")  # finds numbers such as .05, which TOML rejects
@@ -131,7 +131,9 @@ def _document(path: Path) -> Mapping[str, Any]:
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise MaterialError(f"{path} is not a material file: its lists or tables nest too deep") from None
+        raise MaterialError(
+            f"{path} is not a material file: its lists or tables are nested too deeply"
+        ) from None
     except ValueError as error:  # invalid TOML, or a number with too many digits
         hint = "; numbers begin with a digit, 0.05" if _BARE_POINT.search(text) else ""
         raise MaterialError(f"{path} is no TOML file: {one_line(str(error))}{hint}") from error

@@ -58,5 +58,5 @@ def content(path: Path, measurements: str) -> bytes:
         raise SourceError(
             f"{path}: no such file; `nma data` says where to get {measurements} files"
         ) from None
-    except (OSError, ValueError) as e:  # ValueError: the name contains a NUL
+    except (OSError, ValueError) as e:  # a ValueError means that the name contains a NUL character
         raise SourceError(f"{path}: cannot be read: {getattr(e, 'strerror', e)}") from None

@@ -66,8 +66,9 @@ def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True)
     backward, detour = _unscattered(stack, wo, back, wi, there, rng, False)
     scattered = _scattered(stack, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
     # `backward` estimates f cos(theta_i), because its walks start from wo. Since f is reciprocal, `backward` times
-    # cos(theta_o) / cos(theta_i) is an estimate of f cos(theta_o). When light leaves the coat, its radiance is divided
-    # by the squared index of refraction. `scattered` does not contain this factor, so the factor is applied here.
+    # cos(theta_o) / cos(theta_i) is an estimate of f cos(theta_o). `scattered` estimates light inside the coat. When
+    # light leaves the coat, its radiance is divided by the squared index of refraction, so `scattered` is divided by
+    # the squared index here.
     index2 = stack.eta_top * stack.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(stack, wi, wo)
@@ -104,7 +105,7 @@ def _crossing(stack: Stack, walk: Walk) -> Walk:
 
 
 def _transmittance(stack: Stack, depth: Float, w: Vec3) -> Float:
-    """Fraction of light along `w` that crosses the fraction `depth` of the slab without a collision."""
+    """The fraction of the light along `w` that crosses a layer of thickness `depth` (0 to 1) without a collision."""
     return ops.exp(-stack.sigma_t * depth / ops.maximum(ops.absolute(w.z), 1e-7))
 
 
@@ -123,7 +124,8 @@ class _Detour:
     def offer(self, walk: Walk, rng: Random) -> _Detour:
         """Considers the current segment of `walk`, and either chooses this segment or keeps the previous choice.
 
-        A segment's weight is the brightest channel of its throughput. Its probability is proportional to its weight.
+        A segment's weight is the brightest channel of its throughput. The probability of a segment is proportional to
+        the segment's weight.
         """
         weight = ops.select(walk.alive, ops.max_component(throughput(walk)), 0.0)
         total = self.total + weight
@@ -152,9 +154,9 @@ def _unscattered(
       towards wo.
     - Connection at the exit: the walk is reflected in a random direction, and the coat refracts the light along wo.
 
-    If `forward` is false, the caller has exchanged wi and wo. The connections are then at the path's first hit and at
-    its entrance. If a path has a single hit, the first hit is also the last hit, so only the first call connects at
-    this hit.
+    If `forward` is false, the caller has exchanged wi and wo, so the connections are at the path's first hit and at its
+    entrance. If a path has a single hit, the first hit is also the last hit, so only the first call connects at this
+    hit.
 
     The balance heuristic (Veach 1997, eq. 9.8) weights each possible connection of a path by the density of sampling
     all other events of the path. This density is proportional to the reciprocal of the connection's own density, which
@@ -296,9 +298,9 @@ def lobes(stack: Stack, wi: Vec3) -> tuple[tuple[Float, Float, Float], Float]:
     The lobes are the coat's reflection, the conductor's reflection seen through the coat, and a cosine lobe. Tilted
     facets of the conductor and of the coat widen the second lobe. Let cos_i be the cosine of wi, and cos_t the cosine
     after refraction. A facet of the conductor shifts the tangential part of a direction by 2 cos_t times the facet's
-    slope. A facet of the coat shifts the tangential part by (eta cos_t - cos_i) / eta times the facet's slope, and
-    light crosses the coat twice. The variances of the three shifts are added. The second lobe is that of a conductor
-    whose facets alone would cause the total variance.
+    slope. A facet of the coat shifts the tangential part by (eta cos_t - cos_i) / eta times the facet's slope. Light
+    crosses the coat twice, so the variances of three shifts are added. The second lobe is that of a conductor whose
+    facets alone would cause the total variance.
     """
     eta, cos_i = stack.eta_top, ops.maximum(wi.z, 1e-3)
     fresnel, cos_t = fresnel_dielectric(cos_i, eta)

@@ -31,7 +31,7 @@ from nma.sources.lookup import Lookup
 SHAPE = (90, 90, 180)
 # Factors for red, green and blue that convert a number in the file to f [1/sr].
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
-# The size of every file in bytes.
+# The size of every MERL file in bytes.
 BYTES = 12 + 3 * 8 * math.prod(SHAPE)
 
 # `Merl.of` marks an entry as not measured if the cosine of either direction is smaller than `_MIN_COS`, because the

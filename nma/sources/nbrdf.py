@@ -6,7 +6,7 @@ to RGL's materials NBRDF-RGL.
 
 A weights file (`.npz`) has `names` (n,) and `weights` (n, 675). A row of weights has the matrices and biases of the
 network 6 -> 21 -> 21 -> 3 with ReLU, in the order k1 (6, 21), b1, k2 (21, 21), b2, k3 (21, 3), b3. A layer maps x to x
-@ k + b.
+@ k + b, where k is the matrix and b the bias.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from nma.sources.half_difference import half_difference
 SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
-# There are two published sets of networks. A weights file is recognised by a material that only one of the sets
-# contains (the keys); the values are the names of the sets.
+# There are two published sets of networks. Each key is a material that only one of the sets contains, and its value is
+# the name of that set. A weights file with this material belongs to the set.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 
@@ -87,7 +87,7 @@ def read(path: str | Path) -> tuple[list[str], NDArray[np.float32]]:
             names, weights = f["names"], f["weights"]
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; `nma data` says where to get NBRDF networks") from None
-    except Exception as e:  # zipfile and zlib have error types of their own
+    except Exception as e:  # zipfile and zlib have their own error types, so all are caught
         raise SourceError(
             f"{path}: not a weights file of NBRDF networks (.npz with names and weights): {e}"
         ) from None
@@ -114,7 +114,7 @@ def _claims(path: Path) -> bool:
     try:
         with arrays(path) as f:
             return "weights" in f
-    except Exception:  # zipfile has error types of its own
+    except Exception:  # zipfile has its own error types, so all are caught
         return False
 
 

@@ -155,7 +155,7 @@ class Tables:
             raise TableError(
                 f"{path}: not a reference file (.npz with the arrays params, table and walks): {e}"
             ) from None
-        except Exception as e:  # zipfile and zlib raise exceptions of their own, so all are caught
+        except Exception as e:  # zipfile and zlib have their own error types, so all are caught
             raise TableError(f"{path}: damaged archive: {e}") from None
         _check_arrays(path, params, values, walks, error)
         walks = np.broadcast_to(walks, len(params)).astype(np.int64)

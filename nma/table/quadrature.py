@@ -17,7 +17,7 @@ from nma.ops import Float, Vec3
 from nma.table.grid import ISOTROPIC, Grid
 
 # The density of points increases towards the mirror direction, down to the scale of a lobe whose microfacet width
-# (alpha) is `FINEST`. `FINEST` is half that of the narrowest lobe, because training with coarser points makes the
+# (alpha) is `FINEST`. `FINEST` is half the width of the narrowest lobe, because training with coarser points makes the
 # narrowest lobes too broad.
 FINEST = 0.0005
 

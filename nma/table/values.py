@@ -52,14 +52,14 @@ _NOISELESS = 1 << 40
 
 
 def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POINTS) -> Tables:
-    """The table of one source. The table's `params` have the shape (1, 0).
+    """Makes the table of one source. The table's `params` have the shape (1, 0).
 
     A bin's value is the mean over `points` points (a multiple of 16), evenly spread in the bin. Bins near the mirror
     direction have 32 times as many points, with a density that increases towards the mirror direction, down to the
     scale of the narrowest lobe. Equal arguments give equal tables. The table's `error` is the standard error, estimated
-    from four independent sets of points. This error does not include rounding, nor errors of the source itself, such as
-    the noise of a measurement. The table's `walks` is the number of random walks that would give a bin the same error:
-    the median over all bins, at most 2^40.
+    from four independent sets of points. `error` includes neither rounding nor errors of the source itself, such as the
+    noise of a measurement. The table's `walks` is the number of random walks that would give a bin the same standard
+    error: the median over all bins, at most 2^40.
 
     Raises `TableError` for an anisotropic source on an isotropic grid, for a wrong number of points, and for values
     that are not finite.
@@ -145,8 +145,8 @@ def _moments(
 ) -> NDArray[np.float64]:
     """The means (bins, 8) of w, w^2, w f and w^2 f over one set of points; w is the weight and f the RGB value.
 
-    The points are those of a lattice, shifted at random for each bin, and the mirror image 1 - u of each point u. The
-    mirror images make the means of linear functions exact.
+    The points are those of a lattice, shifted at random for each bin, and the mirror image 1 - u of each point u. With
+    these pairs of points, the means of linear functions are exact.
     """
     Float, UInt32 = dr.auto.Float, dr.auto.UInt32
     flat = UInt32(bins.astype(np.uint32))

@@ -96,7 +96,7 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     if not recipe.albedo > 0:
         return 0.0
     # The square of a noisy estimate's error would contain the variance of the estimate. The expected product of the
-    # errors of two independent estimates does not contain the variance.
+    # errors of two independent estimates does not contain their variance.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 

@@ -30,7 +30,7 @@ from nma.train.run import record_of
 # determine this parameter.
 CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
 
-# A step has few bins, but many points in each bin. With few points, the averages of narrow lobes are noisy. Eq. 7
+# A step has few bins, but many points in each bin. With few points, the averages of narrow lobes are noisy, and eq. 7
 # counts the noise of an average as an error, so fits would avoid narrow lobes. A Principled BRDF fitted to its own
 # table ended at a log loss of .0023 with 4 points per bin, and at .00015 with 64 points; the best possible log loss is
 # .00014. The log loss alone neglects bright, narrow lobes: fitted without the albedo error, copper under a blue medium
@@ -70,7 +70,7 @@ class Constant(NamedTuple):
     """Result of `fit_constant`.
 
     `principled`: the parameters as floats. `log_loss` (eq. 7) and `figures`: errors over the whole table. `adapter`: an
-    adapter with the same parameters, whose network has no inputs. `brightness`: the light that the fitted BRDF
+    adapter with the fitted parameters, whose network has no inputs. `brightness`: the light that the fitted BRDF
     reflects, summed over all directions, divided by the light that the material reflects.
     """
 
