@@ -10,7 +10,7 @@ _LONGEST = 600  # longer messages are shortened, because some of Mitsuba's error
 
 
 class NmaError(Exception):
-    """The base of all errors that this package raises on purpose. The command line prints these errors without a
+    """The base class of all errors that this package raises on purpose. The command line prints these errors without a
     traceback."""
 
 
@@ -64,7 +64,7 @@ def closest(given: str, known: Sequence[str]) -> str | None:
 
 
 def some(names: Sequence[str]) -> str:
-    """Joins the names into a text, but only the first five, because there may be hundreds."""
+    """Joins only the first five names into a text, because there may be hundreds of names."""
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 

@@ -89,7 +89,7 @@ class Param:
         return (x - self.low) / (self.high - self.low)
 
     def draw(self, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-        """Random values (n, size), drawn from the parameter's law, but uniform for "conductor" (see
+        """Random values (n, size), drawn from the parameter's law. For the law "conductor", the values are uniform (see
         `ParamSpace.sample`)."""
         u = rng.random((n, self.size))
         if self.law == "log10":

@@ -180,7 +180,7 @@ HEADERS = {
         lambda h: _with(h, directional=False, reciprocal=True),
         r"maps \d+ inputs to 23 .*says",
     ),
-    "other instances": (lambda h: _with(h, instances=3), "23 outputs, but its description says .* to 35"),
+    "other instances": (lambda h: _with(h, instances=3), "23 outputs, but the metadata says .* to 35"),
     "no instances": (lambda h: _with(h, instances=0), "blend has 0 instances"),
     "other hidden layers": (lambda h: _with(h, hidden=[32, 32, 64]), r"not have the widths \[32, 32, 64\]"),
     "more hidden layers": (lambda h: _with(h, hidden=[32] * 4), "'layer4.weight' is missing"),

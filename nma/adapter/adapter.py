@@ -165,8 +165,8 @@ class Adapter:
     def check(self, params: ArrayLike, clamp: bool = False) -> NDArray[np.float64]:
         """Checks the parameters `params` of n materials and returns them as float64 (n, columns).
 
-        An adapter of a class accepts parameters within the training range; with `clamp`, it clamps other parameters to
-        that range. An adapter of a single material accepts only the parameters of this material. Raises `ParamError`
+        An adapter of a class accepts parameters within the training range; with `clamp`, other parameters are clamped
+        to that range. An adapter of a single material accepts only the parameters of this material. Raises `ParamError`
         for parameters that are not accepted.
         """
         known = self.material
@@ -236,7 +236,7 @@ class Adapter:
             )
 
     def _check(self, path: Path, dialect: str) -> None:
-        """Raises `WeightsError` for a network that does not fit its description or this version's target."""
+        """Raises `WeightsError` for a network that does not fit the file's metadata or this version's target."""
         self._check_material(path)
         if dialect != DIALECT:
             raise WeightsError(
@@ -261,7 +261,7 @@ class Adapter:
         if found != (inputs, self.size):
             raise WeightsError(
                 f"{path}: the network maps {found[0]} inputs to {found[1]} outputs, "
-                f"but its description says {inputs} to {self.size}; train again"
+                f"but the metadata says {inputs} to {self.size}; train again"
             )
 
     def _check_material(self, path: Path) -> None:

@@ -21,7 +21,7 @@ Encoder = Callable[[Sequence[Float], Vec3 | None], list[Float]]
 
 # The cosine of 84 degrees, near which the reflectance of metals has a minimum before it rises to 1.
 GRAZING = 0.1045
-# Cosines of the refracted direction that are smaller than this value are set to this value.
+# Cosines of the refracted direction that are smaller than MIN_COS_T are replaced by MIN_COS_T.
 MIN_COS_T = 0.05
 
 

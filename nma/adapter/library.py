@@ -95,7 +95,7 @@ class Library:
                 f"{len(names)} materials need {len(names)} weights of at least 0, got {shares.tolist()}"
             )
         if not shares.sum() > 0:
-            raise ParamError("the weights of a mixture are all 0; make one of them positive")
+            raise ParamError("the weights of a mixture are all 0; make at least one weight positive")
         codes = np.stack([self.code(name) for name in names])
         return (shares / shares.sum() @ codes).astype(np.float32)
 

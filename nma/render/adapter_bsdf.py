@@ -177,8 +177,8 @@ class _Query(NamedTuple):
 class _LastBrdf:
     """Keeps the BRDF of one call for the next call, so that the network runs once at a shading point.
 
-    At each shading point, Mitsuba calls `eval_pdf` and then `sample`, because it does not call `eval_pdf_sample` of
-    Python BSDFs. Without this class, the kernel that Dr.Jit records would contain the network twice.
+    At each shading point, Mitsuba calls `eval_pdf` and then `sample`, because Mitsuba does not call `eval_pdf_sample`
+    of Python BSDFs. Without this class, the kernel that Dr.Jit records would contain the network twice.
 
     The class keeps the BRDF, whose numbers are variables of the kernel that is being recorded, and the query that asked
     for the BRDF. The query keeps its own variables alive, because Dr.Jit gives the indices of freed variables to new

@@ -19,7 +19,7 @@ NODES = 128
 # The count of numbers that one gather fetches. Dr.Jit can fetch a block of numbers at once if the length of the block
 # is a power of two, so 24 numbers need three gathers of 8.
 PACKET = 8
-# Smaller cosines are replaced by this value, so that no adapter is evaluated exactly at the horizon.
+# Cosines smaller than MIN_COS are replaced by MIN_COS, so that no adapter is evaluated exactly at the horizon.
 MIN_COS = 1e-4
 
 
@@ -61,8 +61,8 @@ class Curves:
         }
 
     def at(self, wi: Vec3, columns: Sequence[Float], active: Any = True) -> Brdf:
-        """The BRDF for the view direction `wi`. `columns` are the parameters for which the curves were computed; they
-        are needed only for derivatives."""
+        """The BRDF for the view direction `wi`. `columns`, the parameters for which the curves were computed, are
+        needed only for derivatives."""
         flat = self._looked_up(self.table, wi.z, active)
         for k, slope in self.slopes.items():
             if dr.grad_enabled(columns[k]):
@@ -118,8 +118,8 @@ def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], wi: 
 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:
-    """One array with the first entry of each value, then the second entry of each value, and so on. Scalars are
-    repeated `width` times."""
+    """One array that contains the first entries of all `values`, then the second entries, and so on. A scalar counts as
+    an array of `width` equal entries."""
     mi = _mitsuba()
     return dr.ravel(mi.ArrayXf([mi.Float(value) + dr.zeros(mi.Float, width) for value in values]))
 

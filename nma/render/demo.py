@@ -27,7 +27,7 @@ DEPTH = 6
 TEXTURE_SCALE = 2.0
 STAND_IN_RUNS = 2  # how often `principled` is rendered; only its time is reported
 FIRST_SPP = 16  # samples per pixel of the first pictures, which come before the measurements
-# FLIP errors of this value or more are shown in the brightest colour of the difference picture.
+# FLIP errors from FLIP_SCALE upwards are shown in the brightest colour of the difference picture.
 FLIP_SCALE = 0.5
 Progress = Callable[[str, int], None]
 
@@ -203,8 +203,8 @@ def _first_frames(scene: Scene, settings: Settings, progress: Progress) -> dict[
 def _measured(
     scene: Scene, first: dict[str, Frame], settings: Settings, progress: Progress
 ) -> tuple[NDArray[np.float32], list[Line]]:
-    """Returns the reference picture, which has other random seeds than the measured frames, and the table's line for
-    each BSDF."""
+    """Returns the reference picture, rendered with other random seeds than the measured frames, and the table's line
+    for each BSDF."""
     truth = render_passes(
         _load(scene.bsdfs["layered"], settings),
         settings.reference_spp,

@@ -15,7 +15,7 @@ def clamped(integrator: Any, limit: float) -> Any:
     paths reach the light.
 
     Raises:
-        ParamError: the integrator does not trace one path for each sample, or it writes channels other than colour.
+        ParamError: the integrator does not trace one path for each sample, or writes channels other than colour.
     """
     import mitsuba
 

@@ -95,9 +95,9 @@ class Inputs:
     def check(self, numbers: bool = False) -> None:
         """Checks the textures, and with `numbers` all inputs, that have changed since the last check.
 
-        Raises `ParamError` or `TextureError` for a bad value, and restores the last good value first. A bad value must
-        not stay, because Dr.Jit records all existing BSDFs into its kernels, so the error would also stop the rendering
-        of other scenes.
+        For a bad value, restores the last good value, and raises `ParamError` or `TextureError`. A bad value must not
+        stay, because Dr.Jit records all existing BSDFs into its kernels, so the error would also stop the rendering of
+        other scenes.
 
         BSDFs call this method wherever they use inputs, because Mitsuba does not report edits of a texture that several
         BSDFs share. While Dr.Jit records a frozen function, values cannot be read, so edited values are clamped to the

@@ -50,7 +50,7 @@ def material_bsdf(
         raise ParamError(
             f"{material.name} is of class {material.class_name}, but the BSDF 'layered' simulates only class "
             f"{LAYERED3.name}; `nma simulate` makes a table of {material.name}, and `nma evaluate` compares an adapter "
-            "with it"
+            "with this table"
         )
     settings = {"adapter": str(adapter), "clamp": clamp} if model == "nma" else {}
     return {"type": model, **settings} | {name: _value(value) for name, value in material.values.items()}

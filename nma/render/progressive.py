@@ -28,7 +28,7 @@ def render_passes(
     integrator: Any = None,
     progress: Callable[[int], None] = lambda samples: None,
 ) -> NDArray[np.float32]:
-    """Render a loaded scene in passes and average them: (height, width, channels) float32.
+    """Render a loaded scene in passes and average the passes: (height, width, channels) float32.
 
     Equal seeds give equal pictures. Every pass of every seed has its own random stream.
 

@@ -69,7 +69,7 @@ def preview_scene(
     """The preview scene with the given material, ready for `mi.load_dict`.
 
     Args:
-        bsdf: Mitsuba dictionary of the material; it is placed under the key `material`.
+        bsdf: Mitsuba dictionary of the material, which is placed under the key `material`.
         size: width and height in pixels.
         spp: samples per pixel that `mi.render(scene)` uses by default.
         max_depth: the largest number of edges of a path, as Mitsuba counts them (1 shows only emitters).

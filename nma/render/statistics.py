@@ -78,7 +78,7 @@ def measure(
         render_options: passed to `mi.render`, such as `sensor` or `integrator`.
 
     Raises:
-        ParamError: there are fewer than two seeds, or two of them are equal.
+        ParamError: there are fewer than two seeds, or two seeds are equal.
     """
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     if len(numbers) < 2 or len(set(numbers)) < len(numbers):

@@ -23,7 +23,7 @@ from nma.target.principled import (
     spec_fresnel,
 )
 
-# This value is added to the bounds of the diffuse and the specular lobe, so that both lobes are sampled even where they
+# MIN_ALBEDO is added to the bounds of the diffuse and the specular lobe, so that both lobes are sampled even where they
 # reflect nothing.
 MIN_ALBEDO = 1e-4
 # The fitted formulas are too low by at most these margins. To get upper bounds, the margins are added to the formulas.

@@ -89,7 +89,7 @@ ANISOTROPIC_PARAMS = tuple(replace(p, in_plane=False) for p in MEASURED_PARAMS)
 
 # Ranges on which fields of the Principled BRDF are defined; all other fields have the range 0 .. 1.
 _LIMITS = {
-    "specular": (0.0, 12.0),  # 12.5 gives a reflectance of 1, which no index of refraction has
+    "specular": (0.0, 12.0),  # 12.5 would be a reflectance of 1, which no index of refraction has
     "anisotropic": (-1e6, 1.0),
     "fade": (-1.0, 1.0),
     "fade_width": (0.0, 1e6),
@@ -125,7 +125,8 @@ def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
 
 
 def _check(p: TargetParam) -> None:
-    """Raises `WeightsError` for a parameter that `Principled` does not have, or a range on which it is not defined."""
+    """Raises `WeightsError` for a parameter that `Principled` does not have, or for a range on which the parameter is
+    not defined."""
     size = 3 if p.name == "base_color" else 1
     if p.name not in Principled._fields or type(p.size) is not int or p.size != size:
         raise WeightsError(

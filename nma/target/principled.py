@@ -19,7 +19,7 @@ Deliberate differences from Mitsuba's plugin, all of them small:
   invalid, too.
 - Lobes are sampled in proportion to a bound of their albedo, with one density for the whole blend (`nma.target.blend`).
 
-The functions here use only straight-line arithmetic and `select`, so that `nma.export` can print them as C++.
+The functions of this module use only straight-line arithmetic and `select`, so that `nma.export` can print them as C++.
 """
 
 from __future__ import annotations
