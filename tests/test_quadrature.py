@@ -13,7 +13,7 @@ from scipy import stats
 
 from nma import ops
 from nma.jit import dr
-from nma.lattice import lattice_points
+from nma.lattice import lattice_points, lattice_steps
 from nma.microfacet import ggx_d, smith_g1
 from nma.ops import Vec3
 from nma.table import Grid, quadrature
@@ -253,6 +253,15 @@ def test_other_grids_work_too():
             (azimuth_away(points), (4.5 - p) * math.pi / 5),
         ):
             assert_means((points.weight * function).mean(axis=0), expected)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3, 4])
+def test_the_steps_of_a_lattice_are_powers_of_the_inverse_of_its_root(dimensions):
+    """The root x satisfies x^(d+1) = x + 1 (Roberts 2018)."""
+    steps = lattice_steps(dimensions)
+    root = 1.0 / steps[0]
+    assert root ** (dimensions + 1) == pytest.approx(root + 1.0, rel=1e-14)
+    assert steps == pytest.approx([root**-k for k in range(1, dimensions + 1)], rel=1e-14)
 
 
 def test_lattice_points_are_well_spread():
