@@ -148,7 +148,10 @@ def test_tables_of_an_unknown_class_are_refused_by_name(command, nma, tmp_path, 
     )
     code, _, told = nma(*command.split())
     assert code == 1
-    assert "x.npz: its materials are of class 'paint'; this version has layered3, measured, library" in told
+    assert (
+        "x.npz: its materials are of class 'paint', but this version has only layered3, measured, library"
+        in told
+    )
 
 
 def test_training_refuses_data_of_another_class(bare):
