@@ -101,8 +101,8 @@ def load(name_or_path: str | Path) -> Material:
     """Loads a shipped material by its name, or a material from a file whose name ends in `.toml`.
 
     The material's values must be physically valid; an adapter checks later whether the values are in the adapter's
-    training range. Texture files must exist; `Texture.read` reads them later. Raises `MaterialError` with the file and
-    the fault.
+    training range. Texture files must exist; `Texture.read` reads them later. Raises `MaterialError`, whose message
+    names the file and the fault.
     """
     if str(name_or_path).endswith(".toml"):
         path = Path(name_or_path)

@@ -4,8 +4,8 @@ This module reads and checks the files, and Mitsuba's BSDF `measured` evaluates 
 Jakob 2018, "An Adaptive Parameterization for Efficient Material Acquisition and Rendering". A file has a header and a
 set of named arrays, called fields. The header has a magic string, the version and the number of fields. For each field
 the header has the name, rank, type, offset and shape. Mitsuba maps the file into memory without comparing the offsets
-with the file's size, so Mitsuba would read past the end of a truncated file. To prevent such reads, this module checks
-a file before Mitsuba reads the file.
+with the file's size, so Mitsuba would read past the end of a truncated file. To prevent a read past the end of a file,
+this module checks the file before Mitsuba reads it.
 """
 
 from __future__ import annotations

@@ -246,7 +246,10 @@ def _check_arrays(
         if array.dtype.kind not in "fiu":
             raise TableError(f"{path}: {name} holds {array.dtype}, not numbers")
     if params.ndim != 2 or values.ndim not in (5, 6) or values.shape[0] != n or values.shape[-1] != 3:
-        raise TableError(f"{path}: params {params.shape} and table {values.shape} do not belong together")
+        raise TableError(
+            f"{path}: params {params.shape} and table {values.shape} are not (n, columns) and "
+            "(n, theta_i[, phi_i], theta_o, phi, 3)"
+        )
     if error is not None and error.shape != values.shape:
         raise TableError(f"{path}: error has shape {error.shape}, but table has shape {values.shape}")
     if walks.shape not in ((), (1,), (n,)) or not (walks > 0).all():

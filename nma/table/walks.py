@@ -87,8 +87,8 @@ def _tabulate_group(
     if not error:
         return moments[0] / weight, None
     sums, squares = moments
-    # If all walks of a row end in one bin with the same throughput, the variance of their throughputs is 0. The
-    # variance of a single hit is used instead, so that the standard error is not 0.
+    # If all walks of a row end in one bin with the same throughput, the variance of their throughputs is 0, so the
+    # variance of a single hit is used instead.
     variance = np.maximum(squares - sums * sums / sweeps, squares / sweeps)
     return sums / weight, np.sqrt(variance) / weight
 
