@@ -48,10 +48,10 @@ class Source(Protocol):
     """A stochastic appearance model g(wi) -> (wo, throughput), paper eq. 8, simulated event by event.
 
     A walk leaves the material in a direction wo, with a throughput. For any set of directions, the integral of f
-    cos(theta_o) over the set is the expected throughput, where a walk that leaves outside the set counts as throughput
-    0. A model that can only evaluate f may draw wo from a density p at the first event and return the throughput f
-    cos(theta_o) / p. Throughputs should hardly exceed 1, because tables sum them as 32-bit integers, which could
-    overflow.
+    cos(theta_o) over the set is the expected throughput of a walk. In this mean, a walk that leaves outside the set has
+    throughput 0. A model that can only evaluate f may draw wo from a density p at the first event and return the
+    throughput f cos(theta_o) / p. Throughputs should hardly exceed 1, because tables sum them as 32-bit integers, which
+    could overflow.
     """
 
     space: ParamSpace

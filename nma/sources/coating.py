@@ -2,9 +2,9 @@
 
 The model is from Weidlich and Wilkie 2007, "Arbitrarily Layered Micro-Facet Surfaces". The model is the sum of two
 microfacet reflections: the coat's reflection and the metal's reflection. The metal's reflection is evaluated for the
-directions refracted at the mean surface. The metal's reflection is multiplied by two transmittances for each of the two
-directions: the Fresnel transmittance of the coat's surface, and the transmittance of the absorbing coat. Light that
-bounces between coat and metal is left out, so the model is darker than a simulation of the stack.
+directions refracted at the mean surface. For each of the two directions, the metal's reflection is multiplied by the
+Fresnel transmittance of the coat's surface, and by the transmittance of the absorbing coat. Light that bounces between
+coat and metal is left out, so the model is darker than a simulation of the stack.
 """
 
 from __future__ import annotations

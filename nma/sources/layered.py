@@ -1,7 +1,7 @@
 """Position-free random walks through a rough dielectric over a homogeneous medium over a rough conductor.
 
 The method is that of Guo, Hasan and Zhao 2018, "Position-Free Monte Carlo Simulation for Arbitrary Layered BSDFs". The
-layers are the same at every point of the surface, so the position along the surface does not matter: a walk consists of
+layers are the same at every point of the surface, so the position along the surface does not matter. A walk consists of
 a direction, a height in a slab of thickness 1, and a throughput. The code needs Dr.Jit, but no renderer.
 """
 

@@ -59,7 +59,7 @@ def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POI
     scale of the narrowest lobe. Equal arguments give equal tables. The table's `error` is the standard error, estimated
     from four independent sets of points. `error` includes neither rounding nor errors of the source itself, such as the
     noise of a measurement. The table's `walks` is the number of random walks that would give a bin the same standard
-    error: the median over all bins, at most 2^40.
+    error. The number is the median over all bins, and at most 2^40.
 
     Raises `TableError` for an anisotropic source on an isotropic grid, for a wrong number of points, and for values
     that are not finite.
@@ -130,7 +130,7 @@ def _means(
         raise TableError(f"{values.name}: has values that are not finite, first in bin {place}")
     weight, square, value, product = sets[..., :1], sets[..., 1:2], sets[..., 2:5], sets[..., 5:]
     # The weights serve as a control variate, because their expected value is known to be 1. If the mean weight of a set
-    # is not 1, the mean value of the set has an error that is correlated with this deviation, and this part of the
+    # is not 1, the mean value of the set has an error that is correlated with the deviation. The correlated part of the
     # error is subtracted. If the source hardly changes within a bin, the mean value becomes almost exact.
     variance = np.mean(square - weight * weight, axis=0)
     covariance = np.mean(product - weight * value, axis=0)

@@ -33,9 +33,9 @@ CONSTANT_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("flatness"))
 # A step has few bins, but many points in each bin. With few points, the averages of narrow lobes are noisy, and eq. 7
 # counts the noise of an average as an error, so fits would avoid narrow lobes. A Principled BRDF fitted to its own
 # table ended at a log loss of .0023 with 4 points per bin, and at .00015 with 64 points; the best possible log loss is
-# .00014. The log loss alone neglects bright, narrow lobes: fitted without the albedo error, copper under a blue medium
-# and a smooth coat became 14 % too dark. With `albedo` = 1 (the weight of the albedo error), the same material became 1
-# % too dark, at a log loss of .0172 instead of .0145.
+# .00014. The log loss alone neglects bright, narrow lobes. When copper under a blue medium and a smooth coat was fitted
+# without the albedo error, the fit was 14 % too dark. With `albedo` = 1 (the weight of the albedo error), the fit of
+# the same material was 1 % too dark, at a log loss of .0172 instead of .0145.
 CONSTANT = Recipe(
     network="none",
     instances=1,
