@@ -143,7 +143,8 @@ def _try_folder(folder: Path, *names: str) -> None:
 
 
 def _place(path: Path) -> Path:
-    """The path of the file that is replaced. For a symbolic link, the link's target is replaced and the link stays."""
+    """The path of the file that a write to `path` replaces. For a symbolic link, the link's target is replaced and the
+    link stays."""
     return Path(os.path.realpath(path))
 
 

@@ -48,7 +48,7 @@ def sample_visible_normal(wi: Vec3, alpha_x: Float, alpha_y: Float, u1: Float, u
     phi = (2.0 * ops.PI) * u1
     z = 1.0 - u2 * (1.0 + wi_std.z)
     sin_theta = ops.safe_sqrt(1.0 - z * z)
-    # The half vector of this point and wi_std is the visible normal. Scale this normal back to the widths alpha.
+    # The half vector of the drawn point and wi_std is the visible normal. Scale this normal back to the widths alpha.
     m_std = Vec3(sin_theta * ops.cos(phi), sin_theta * ops.sin(phi), z) + wi_std
     return ops.normalize(Vec3(alpha_x * m_std.x, alpha_y * m_std.y, ops.maximum(m_std.z, 1e-9)))
 

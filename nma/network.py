@@ -24,11 +24,11 @@ _MOST_LAYERS, _MOST_NEURONS = 64, 1024
 Layers = list[tuple[Any, Any]]  # for each layer: the matrix (out, in) and the bias (out,)
 _Activation = Callable[[Float], Float]
 
-# `forward_lanes` splits a dot product into this many sums. A query of a 5x64 network took .56 us on a Zen 4 core with 4
+# `forward_lanes` splits a dot product into _SUMS sums. A query of a 5x64 network took .56 us on a Zen 4 core with 4
 # sums, and .70 us with one sum.
 _SUMS = 4
-# With AVX-512, `forward_lanes` computes the neurons in blocks of this size, because the sums of a block fit in the 32
-# registers. A query of a 5x64 network took .34 us on an Intel Xeon (family 6, model 167) with blocks, and .47 us
+# With AVX-512, `forward_lanes` computes the neurons in blocks of _BLOCK neurons, because the sums of a block fit in the
+# 32 registers. A query of a 5x64 network took .34 us on an Intel Xeon (family 6, model 167) with blocks, and .47 us
 # without. With the 16 registers of AVX2, blocks bring no gain.
 _BLOCK = 28
 

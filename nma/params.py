@@ -36,7 +36,7 @@ class Bounds(NamedTuple):
     """The range from `low` to `high`. Every check of a parameter calls `bad`, and reports the message that `refusal`
     returns.
 
-    Methods take NumPy or Dr.Jit arrays. `low` and `high` may also be arrays, with one bound per column.
+    The methods accept NumPy or Dr.Jit arrays. `low` and `high` may also be arrays, with one bound per column.
     """
 
     low: Any

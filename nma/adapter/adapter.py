@@ -130,7 +130,7 @@ class Adapter:
 
     @property
     def size(self) -> int:
-        """How many numbers describe the target: 23 for the paper's blend of two instances."""
+        """The count of numbers that describe the target: 23 for the paper's blend of two instances."""
         return output_size(self.instances, self.target)
 
     @property

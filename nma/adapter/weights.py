@@ -26,7 +26,7 @@ from nma.network import Layers
 from nma.params import ParamSpace
 
 FORMAT = 1
-# The deepest nesting of brackets that is read in the metadata. In the files of trained adapters, brackets nest 4 deep.
+# Brackets in the metadata may nest at most MAX_DEPTH deep. In the files of trained adapters, brackets nest 4 deep.
 MAX_DEPTH = 32
 
 

@@ -237,14 +237,14 @@ def _write(path: str | Path, rows: list[Row], lines: list[Line], settings: Setti
 
 
 def _early_row(scene: Scene, frames: dict[str, Frame], settings: Settings) -> Row:
-    """The row of a scene with its first pictures, before anything is measured."""
+    """The contact sheet's row for a scene, with the scene's first pictures, before anything is measured."""
     truth, adapter = (frames[name].image.astype(np.float32) for name in ("layered", "nma"))
     text = f"{settings.first_spp} spp, figures follow"
     return Row(scene.label, [truth, adapter, _difference(adapter, truth)], [text, text])
 
 
 def _row(label: str, truth: NDArray[np.float32], reference: Line, adapter: Line, settings: Settings) -> Row:
-    """The row of a scene, with time, variance and error under the pictures."""
+    """The contact sheet's row for a scene, with time, variance and error under the pictures."""
     captions = [_caption(line, settings) for line in (reference, adapter)]
     captions.append(
         f"mean {adapter.errors['flip_ldr']:.4f}, of noise alone {reference.errors['flip_ldr']:.4f}"

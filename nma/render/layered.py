@@ -25,7 +25,7 @@ from nma.sources import layered_eval
 from nma.sources.base import walk
 from nma.sources.layered import Layered3, Stack
 
-# The albedo at a point is the mean of this many walks. The walks have the same random numbers at all points, so the
+# The albedo at a point is the mean of ALBEDO_WALKS walks. The walks have the same random numbers at all points, so the
 # albedo has an error of up to .06, but no noise.
 ALBEDO_WALKS = 128
 

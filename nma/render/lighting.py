@@ -71,8 +71,8 @@ SOFTBOXES = (
     Softbox((-0.93, -0.42, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
     Softbox((-0.70, -0.72, 0.66), (8.0, 13.5), 1.5, 0.0, (18.0, 17.4, 16.5)),
     Softbox((0.92, -0.15, 0.42), (1.8, 28.0), 1.0, 8.0, (11.8, 12.5, 13.7)),  # a strip on the right
-    Softbox((0.05, 0.70, 0.72), (32.0, 1.8), 1.0, 0.0, (9.4, 9.4, 9.4)),  # a bar above and behind
-    Softbox((-0.85, 0.50, 0.25), (1.8, 18.0), 1.0, 0.0, (8.8, 8.8, 8.8)),  # a strip behind, on the left
+    Softbox((0.05, 0.70, 0.72), (32.0, 1.8), 1.0, 0.0, (9.4, 9.4, 9.4)),  # a bar above and behind the ball
+    Softbox((-0.85, 0.50, 0.25), (1.8, 18.0), 1.0, 0.0, (8.8, 8.8, 8.8)),  # a strip at the back on the left
 )
 HORIZON, ZENITH = (0.038, 0.038, 0.041), (0.20, 0.22, 0.255)
 SKY_RISE = 0.55  # sine of the elevation above which the dome is as bright as at the zenith

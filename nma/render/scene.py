@@ -74,7 +74,7 @@ def preview_scene(
         spp: samples per pixel that `mi.render(scene)` uses by default.
         max_depth: the largest number of edges of a path, as Mitsuba counts them (1 shows only emitters).
         camera: a name in `CAMERAS`, a `Camera`, or None for "hero".
-        envmap: an EXR or HDR file, latitude-longitude, y up in the file. This map replaces all other light.
+        envmap: an EXR or HDR file, latitude-longitude, y up in the file. The environment map replaces all other light.
         envmap_scale: factor on the environment map's radiance.
         lighting: "studio" (softboxes in a dim dome) or "outdoors" (sun, sky and a small lamp).
         mesh: a PLY or OBJ file to show in place of the shader ball, moved to the ball's place and scaled to the ball's

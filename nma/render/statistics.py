@@ -137,8 +137,8 @@ def zscore_images(
     freedom come from the equation of Welch and Satterthwaite; with many runs the t-distribution approaches the normal
     distribution. Each single test has Sidak's significance level, 1 - (1 - false_alarm)^(1/tests), so that equal images
     fail at least one of the tests with a probability of about `false_alarm`. Where few paths reach the light, runs of
-    few samples are far from normally distributed, and equal images fail too often. For scenes with few such paths, use
-    few long runs instead of many short runs.
+    few samples are far from normally distributed, and equal images fail too often. For scenes in which few paths reach
+    the light, use few long runs instead of many short runs.
 
     This function needs scipy, which comes with the extras `compare` and `train`.
 

@@ -80,7 +80,7 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
     The typical facet is tilted towards the viewer, as the visible facets of rough surfaces are at grazing angles.
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    alpha = ops.minimum(alpha_x, alpha_y)  # the smaller width: facets tilt less along its axis
+    alpha = ops.minimum(alpha_x, alpha_y)  # facets tilt less along the axis of the smaller width
     tilt = 0.62 * alpha / (alpha + 0.35)
     facet2 = ops.minimum(cos * cos + tilt * tilt, 1.0)
     facet = ops.sqrt(facet2)

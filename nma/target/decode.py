@@ -149,12 +149,13 @@ def limits(field: str) -> tuple[float, float]:
 
 
 def instance_size(params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
-    """How many numbers describe an instance: 11 for the paper's parameters."""
+    """The count of numbers that describe an instance: 11 for the paper's parameters."""
     return sum(p.size for p in params)
 
 
 def output_size(n_instances: int, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> int:
-    """How many numbers describe a blend: those of n instances and n - 1 weights; 23 for the paper's two instances."""
+    """The count of numbers that describe a blend of `n_instances` instances, including n_instances - 1 weights. The
+    paper's blend of two instances has 23 numbers."""
     return n_instances * instance_size(params) + n_instances - 1
 
 

@@ -15,8 +15,8 @@ Deliberate differences from Mitsuba's plugin, all of them small:
 - Tints divide by max(luminance, 1e-6). For colours darker than 1e-6 the tints fade to black. In Mitsuba, the tint of
   black is white.
 - An instance may fade out towards grazing half vectors (`fade`), where measurements end. Mitsuba's BRDF has no fade.
-- Directions below the horizon are invalid, because there is no back side. Directions whose cosine is at most 1e-9 are
-  invalid, too.
+- Directions below the horizon are invalid, because the BRDF has no back side. Directions whose cosine is at most 1e-9
+  are invalid, too.
 - Lobes are sampled in proportion to a bound of their albedo, with one density for the whole blend (`nma.target.blend`).
 
 The functions of this module use only straight-line arithmetic and `select`, so that `nma.export` can print them as C++.
@@ -43,7 +43,7 @@ class Principled(NamedTuple):
     The first nine fields hold the paper's 11 numbers, each in [0, 1] (`specular` up to 1.6). `anisotropic` stretches
     the specular lobe along x, and `flatness` blends towards the fake subsurface of Burley 2015. The whole BRDF fades
     out where the half vector's cosine to the normal is less than about `fade`. The fade is a smooth step of the width
-    `fade_width`. With the default values, the BRDF does not fade.
+    `fade_width`. With the default values of `fade` and `fade_width`, the BRDF does not fade.
     """
 
     base_color: Color
