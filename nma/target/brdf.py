@@ -13,7 +13,7 @@ from nma.target.plane import Plane
 class Brdf(NamedTuple):
     """A blend and its frame, prepared once for a view direction `wi` per lane, then evaluated and sampled.
 
-    If lobes stretch along the plane of incidence, `plane` is that plane. If no lobes do, `plane` is None, and the
+    `plane` is the plane of incidence if lobes stretch along this plane. For other blends, `plane` is None, and the
     blend's frame is the local frame. Directions are unit vectors of the local frame. The methods need the `wi` for
     which the BRDF was prepared.
     """
