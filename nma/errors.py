@@ -83,7 +83,7 @@ def one_line(message: str) -> str:
     message = re.sub(r'failed to instantiate \w+ plugin of type "\w+": ', "", message)
     head, traceback, _ = message.partition(_TRACEBACK)
     if traceback:
-        # The lines of a traceback are indented. The error message is in the lines after the indented lines.
+        # The lines of a traceback are indented, and the error message comes after the indented lines.
         error = re.search(
             r"^(?!\s)(?:[\w.]+: )?(.*)", message.rpartition(_TRACEBACK)[2].lstrip("\n"), re.M | re.S
         )

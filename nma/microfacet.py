@@ -1,8 +1,8 @@
 """GGX microfacets and Fresnel reflectance, shared by the sources and by the target (CONVENTIONS.md).
 
 Directions are unit vectors (`Vec3`) in the local frame, with z up, and point away from the surface. `alpha` is the
-microfacet width. Anisotropic functions take one width along x and one along y. No function branches on values, so all
-of them run on Dr.Jit, JAX and NumPy.
+microfacet width. Anisotropic functions have two widths as arguments, along x and along y. No function branches on
+values, so all of them run on Dr.Jit, JAX and NumPy.
 """
 
 from __future__ import annotations
