@@ -3,13 +3,13 @@
 python -m bench.density [--variant scalar_rgb llvm_ad_rgb] [--scene environment] [--size 192] [--spp 64] [--runs 3]
     [--rr-depth 5] [--quick] [--output out/bench]
 
-The material is silver under a nearly white medium and a coat. The medium hardly absorbs, so a random walk of the
-simulation ends only when it leaves the material. The adapter was trained for extinctions up to sigma_t = 1, and clamps
-larger extinctions to 1. With clamped extinctions the pictures are wrong, but this bench measures only times. The bench
-makes --runs rounds. Each round renders one frame with every BSDF at every extinction, and the reported times are
-medians over the rounds. The BSDF `nma curves` runs the network when the scene is loaded, the BSDF `nma online` runs the
-network at every shading point. The flatness of a BSDF is its longest time over all extinctions, divided by its shortest
-time.
+The material is silver under a nearly white medium and a coat. The medium absorbs little light, so Russian roulette ends
+few random walks of the simulation. Most walks end when they leave the material, so the walks get longer, and the
+rendering slower, with the extinction. The adapter was trained for extinctions up to sigma_t = 1, and clamps larger
+extinctions to 1. With clamped extinctions the pictures are wrong, but this bench measures only times. The bench makes
+--runs rounds. Each round renders one frame with every BSDF at every extinction, and the reported times are medians over
+the rounds. The BSDF `nma curves` runs the network when the scene is loaded, the BSDF `nma online` runs the network at
+every shading point. The flatness of a BSDF is its longest time over all extinctions, divided by its shortest time.
 
 Writes density.json and density.png.
 """

@@ -215,7 +215,10 @@ def mean_ratios(rows: Sequence[Mapping[str, Row]], simulation: str) -> dict[str,
 
 
 def mean_doubt(rows: Sequence[Mapping[str, Row]], name: str, simulation: str) -> float | None:
-    """Returns the relative standard error of the mean ratio of squared errors, or None if an error is unknown."""
+    """Returns the relative standard error of the geometric mean of the ratios of squared errors (`mean_ratios`).
+
+    The result is None if a squared error or its standard error is unknown.
+    """
     doubts = [row[bsdf]["doubt"] for row in rows for bsdf in (name, simulation)]
     return None if None in doubts else math.hypot(*doubts) / len(rows)
 

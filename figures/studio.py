@@ -23,7 +23,7 @@ def material(number: int, params: NDArray[np.float64]) -> Material:
 
 
 def describe(material: Material) -> str:
-    """Returns a line with the material's roughness (alpha), the coat's index of refraction, and the extinction."""
+    """Returns a line with both microfacet widths (alphas), the coat's index of refraction, and the extinction."""
     short = "{}: alpha {alpha_top:.3f} over {alpha_bottom:.3f}, eta {eta_top:.2f}, sigma_t {sigma_t:.2f}"
     return short.format(material.title, **material.values)
 

@@ -43,7 +43,7 @@ class Bounds(NamedTuple):
     high: Any
 
     def bad(self, x: Any, clamp: bool = False) -> Any:
-        """Whether each number is not finite or, without `clamp`, out of range by more than `ROUNDING`."""
+        """Whether each number is not finite or, without `clamp`, out of range by more than rounding (`ROUNDING`)."""
         finite = abs(x) < np.inf
         if clamp:
             return ~finite

@@ -1,5 +1,6 @@
-// Estimates, by four methods, the light of a small lamp that the simulated material reflects towards the viewer. The
-// four estimates have the same mean. The last two methods use the density `pdf` of the material.
+// A small lamp lights the simulated material. This program estimates by four methods how much of the lamp's light the
+// material reflects towards the viewer. The four estimates have the same mean. The last two methods use the density
+// `pdf` of the material.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example_layered.cpp -o example_layered
 //     ./example_layered

@@ -322,7 +322,9 @@ public:
 
     // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of each node sum to 1, so the
     // interpolated weights sum to 1, too. The lobe probabilities of each node also sum to 1, and so do the interpolated
-    // probabilities.
+    // probabilities. Python (nma/render/curves.py) interpolates only the instances and weights, and computes `scale`
+    // and the lobe probabilities again from the interpolated blend. This function also interpolates `scale` and the
+    // probabilities, which is faster. So the results of C++ and Python differ slightly between two nodes.
     Brdf at(float cos_theta_i) const {
         const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);

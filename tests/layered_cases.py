@@ -66,7 +66,7 @@ def table_of(sums, squares, per_row):
 
 
 def z_scores(found, error, walks, factor=1.0, known=np.inf):
-    """Returns the z-scores of `factor` times `found` minus the table `walks`.
+    """Returns the z-scores of the differences (factor found - w), where w is the table `walks`.
 
     There is a score for each row, and for each bin with over 100 walks and with a relative standard error below
     `known`.

@@ -173,7 +173,7 @@ def test_bounded_adapters_are_dimmed():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_targets_that_stretch_in_the_plane_of_incidence_have_a_frame(kind):
-    """BRDFs whose target does not stretch lobes have no frame, so that Dr.Jit does not record operations for it."""
+    """The BRDF of a target that does not stretch lobes has no `Plane`, so Dr.Jit records no rotations into a plane."""
     assert isinstance(prepared(kind, pairs()[0]).plane, Plane if kind in IN_PLANE else type(None))
 
 

@@ -56,7 +56,7 @@ def imported(tree: ast.AST) -> dict[str, str]:
 
 
 def writes(tree: ast.AST, known: dict[str, str] | None = None) -> Iterator[ast.Call]:
-    """Yields the calls that write a file outside of the blocks named in `WHOLE`."""
+    """Yields the calls that write files, except calls inside a `with` block of a context manager named in `WHOLE`."""
     known = imported(tree) if known is None else known
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.With) and any(name(item.context_expr) in WHOLE for item in node.items):

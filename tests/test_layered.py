@@ -17,7 +17,7 @@ Float, PCG32 = dr.auto.Float, dr.auto.PCG32
 
 
 def layers_of(values, n):
-    """Returns the stack of a material in n lanes.
+    """Returns a `Stack` that holds the same material in each of n Dr.Jit lanes.
 
     The parameters are opaque to the compiler, so that all materials share one kernel.
     """
@@ -110,8 +110,8 @@ def test_comparison_would_see_two_percent():
 def test_integral_of_rough_coat_over_white_conductor():
     """The albedo at cos(theta_i) = .9 is .556, to three digits.
 
-    This rough coat over a conductor is a hard case: in two public programs, evaluation and random walks disagree about
-    its albedo.
+    This rough coat over a conductor is a hard case. In pbrt-v4 (its function `f`) and in the code published with Guo,
+    Hasan and Zhao 2018 (its bidirectional evaluation), evaluation and random walks disagree about its albedo.
     """
     n = 1 << 20
     _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), random(n, 5))

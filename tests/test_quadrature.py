@@ -83,7 +83,10 @@ def azimuth_away(points):
 
 @pytest.mark.parametrize("law", (crowded, uniform))
 def test_means_of_smooth_functions_are_exact(law):
-    """The weights of points have mean 1, and weighted moments of cosines and azimuth are those of uniform points."""
+    """The points' weights have mean 1, and the weighted means of functions over a bin are those of uniform points.
+
+    The functions are products of the cosines and functions of the azimuth.
+    """
     points = law(BINS, 2048, 1)
     i, o, p = BINS.T
     width, step = 1.0 / 40, math.pi / 40
@@ -114,8 +117,9 @@ def test_points_lie_in_their_bins(law, dtype):
     rng = np.random.default_rng(3)
     below_one = np.nextafter(dtype(1), dtype(0))
     corners = [np.full((3, len(i)), u, dtype) for u in (0.0, below_one)]
-    # `bin_points` keeps the cosines of wi and wo above 1e-6. If `bin_points` raises one cosine, the other cosine may
-    # move out of its bin by 1e-6.
+    # `bin_points` first draws the difference s of the cosines, and then sets cos(theta_o) = cos(theta_i) + s. If
+    # `bin_points` raises cos(theta_i) to the least allowed value 1e-6, cos(theta_o) rises by as much, and may leave its
+    # bin by 1e-6.
     slack = 1e-6 + 4 * np.finfo(dtype).eps
     for u in (*corners, rng.random((3, len(i)), dtype), rng.integers(0, 2, (3, len(i))) * below_one):
         points = law(i, o, p, tuple(u.astype(dtype)))

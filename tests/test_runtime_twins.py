@@ -27,7 +27,8 @@ from nma.target.decode import TARGETS, decode, encode, output_size
 
 ROOT = Path(__file__).parent.parent
 CASES = 4000
-# Encodings that do not have the name of a class, each with the class whose parameters the tests encode.
+# Some encodings do not have the name of a class. CLASS_OF maps each of these encodings to the class whose parameters
+# the tests encode.
 CLASS_OF = {"direction": MEASURED, "azimuth": MEASURED, "raw": LIBRARY}
 
 pytestmark = pytest.mark.usefixtures("compiler")

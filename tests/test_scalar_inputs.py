@@ -11,7 +11,7 @@ from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 from nma.images.io import write_exr, write_png
 
-# Each test compiles the plugins or renders in processes of its own.
+# The tests are slow, because a fixture compiles the plugins, and each test runs Mitsuba in processes of its own.
 pytestmark = [pytest.mark.slow]
 
 

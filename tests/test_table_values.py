@@ -146,8 +146,8 @@ def test_stated_errors_are_the_spread_of_the_means():
     stated = tables.error.astype(np.float64)[..., 0]
     assert 0.5 < np.sum(deviation**2) / np.sum(stated**2) < 2.0
     assert 0.5 < np.median(np.abs(deviation)) / np.median(stated) < 1.2
-    # A table from quadrature states how many random walks would give a similar accuracy. With so many walks, about half
-    # of the bins would have a larger error than the table states.
+    # The field `walks` of a table from quadrature is the count of random walks that would give a similar accuracy. With
+    # this count of walks, about half of the bins would have a larger error than the table states.
     counting = metrics.counting_error(
         tables.values[0], int(tables.walks[0]), Grid(10, 10, 10).solid_angle, 10
     )
@@ -269,7 +269,10 @@ FOUR = np.array(
 
 @pytest.mark.parametrize("crowded", (True, False))
 def test_points_of_anisotropic_bins_have_no_preference(crowded):
-    """The weights of points have mean 1, and weighted moments of all four angles are those of uniform points."""
+    """The points' weights have mean 1, and the weighted means of functions over a bin are those of uniform points.
+
+    The functions depend on the cosines and azimuths of wi and wo.
+    """
     grid = Grid(6, 8, 12, phi_i=10)
     bins = np.minimum(FOUR, [5, 9, 7, 11])
     i, a, o, b = bins.T

@@ -1,4 +1,4 @@
-"""The bounds of the lobes' albedos hold for all parameters, and a bounded blend never gains energy.
+"""The bounds of the lobes' albedos hold for all parameters. A bounded blend never reflects more light than it receives.
 
 Albedos are means of value / pdf over many well-spread samples of the target. test_target_sampling.py shows that the
 samples follow their pdf. The tests allow 4 standard errors, computed as if the samples were independent.
@@ -80,7 +80,7 @@ def test_bounded_blends_never_gain_energy(instances):
     blend, mu = random_blends(STRETCHED_PARAMS, instances, 2, 4.0)
     free, _ = estimate(blend, mu)
     found, error = estimate(target.bounded(blend, mu), mu)
-    assert (free > 1.01).mean() > 0.02  # without the bound, some blends gain energy
+    assert (free > 1.01).mean() > 0.02  # without the bound, some blends reflect more light than they receive
     assert (found - 1.0 < 4 * error).all()
 
 

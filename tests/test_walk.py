@@ -67,9 +67,10 @@ def test_white_furnace_loses_nothing(eta_top, sigma_t):
 
 
 def test_perfect_mirror_under_smooth_coat_ends():
-    """A rare microfacet may reflect a grazing walk beyond the critical angle of the coat.
+    """Walks that enter a smooth coat over a perfect mirror at a grazing angle end, and lose no light.
 
-    The walk must still leave the coat or end.
+    A rarely sampled microfacet of the mirror may reflect a walk at more than the coat's critical angle. The coat then
+    reflects the walk back, but the walk must still leave the coat or end.
     """
     found, _ = albedo(0.001, 1 << 15, eta_top=2.0, **WHITE, **FLAT)
     np.testing.assert_allclose(found, 1.0, atol=0.01)
@@ -160,8 +161,8 @@ def test_isotropic_slab_over_black():
 def test_rough_coat_over_white_conductor():
     """The albedo of a rough coat over a white conductor at cos(theta_i) = .9 is .556, to three digits.
 
-    This rough coat over a conductor is a hard case: in two public programs, evaluation and random walks disagree about
-    its albedo.
+    This rough coat over a conductor is a hard case. In pbrt-v4 (its function `f`) and in the code published with Guo,
+    Hasan and Zhao 2018 (its bidirectional evaluation), evaluation and random walks disagree about its albedo.
     """
     found, error = albedo(0.9, 1 << 20, eta_top=1.5, alpha_top=0.2, alpha_bottom=0.4, **WHITE)
     assert_equal_means(found, error + 0.5e-3 / 3.3, 0.556)

@@ -47,13 +47,13 @@ def means_of(layers, batch, recipe):
 
 
 def constant_layers(blend, inputs=1, params=PRINCIPLED_PARAMS):
-    """Returns a network of one layer whose output is `blend` for every input."""
+    """Returns a network of one layer. For every input, the raw output decodes to `blend`."""
     raw = np.array(target.encode(blend, params), np.float32)
     return [(np.zeros((len(raw), inputs), np.float32), raw)]
 
 
 def constant_adapter(blend, params=PRINCIPLED_PARAMS):
-    """Returns an adapter whose network outputs `blend` for every input.
+    """Returns an adapter whose network has the same raw output for every input, the encoding of `blend`.
 
     With `STRETCHED_PARAMS`, the decoder still reduces the stretching towards normal incidence.
     """

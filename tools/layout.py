@@ -60,7 +60,10 @@ def _with_passages(
 
 
 def _ordered(rows: list[list[Place]], links: Sequence[tuple[Place, Place]]) -> list[list[Place]]:
-    """Tries several orders of the places on each floor, and returns the orders with the fewest crossings of links."""
+    """Sorts the places of each floor so that few links cross.
+
+    The search starts from several random orders, and returns the best order that it met.
+    """
     dice = random.Random(0)
     best, fewest = rows, float("inf")
     for _ in range(TRIES):

@@ -4,9 +4,10 @@
 
 Training compares the bin's value in a table with the mean of the target over one or more points in the bin. The
 experiment fits a 3x32 network, whose only input is the view direction, to a smooth conductor and to a layered material.
-All fits to one material use the same table, steps and learning rate. The fits use the paper's loss and target, and
-differ only in the points; but the fit in the last column uses all settings of `nma fit`. Every fit is compared with an
-independent table and rendered.
+All fits to one material use the same table, steps and learning rate. In all columns except the last, the fits differ
+only in the points. These fits use the paper's loss, and a target with the paper's parameters that is also bounded, so
+that it reflects no more light than it receives. The fit in the last column uses the settings of `nma fit`, except for
+the steps and the schedule of the learning rate. Every fit is compared with an independent table and rendered.
 
 Writes supervision.json and supervision.png beside this file. With --quick, makes three short fits and writes to
 out/figures/supervision.

@@ -70,7 +70,7 @@ def plan(sizes: list[int], seeds: int, steps: int, instances: list[str]) -> list
 
 
 class Store:
-    """The folder of weights and metrics, with the data for training and validation.
+    """Trains and evaluates adapters, and stores their weights and metrics in a folder.
 
     Stored weights and metrics that were computed from other data are computed again.
 

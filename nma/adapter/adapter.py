@@ -124,8 +124,8 @@ class Adapter:
 
     @property
     def reciprocal(self) -> bool:
-        """Whether the BRDF f stays the same when wi and wo are swapped, that is, whether the target's parameters do not
-        depend on wi."""
+        """Whether f(wi, wo) = f(wo, wi). The BRDF is reciprocal only if neither the target's parameters nor the factor
+        `scale` depend on wi."""
         return not (self.directional or self.bounded)
 
     @property
@@ -202,12 +202,21 @@ class Adapter:
         return self.decode(raw, wi)
 
     def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF for the view direction `wi` from the raw outputs of the network."""
+        """The BRDF for the view direction `wi` from the raw outputs of the network.
+
+        `prepare` calls this method, and so does `nma.render.curves`, which runs the network itself. The method calls
+        the function `nma.target.decode`, and then sets `Blend.scale` if the adapter is `bounded`.
+        """
         return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
 
     def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF for the view direction `wi` from the flat list of numbers that describe the target
-        (`nma.target.numbers`). `flat` has one array for each number."""
+        """The BRDF for the view direction `wi` from the flat list of numbers that describe the target. `flat` has one
+        array for each number.
+
+        `Curves.at` calls this method with interpolated numbers. The method calls the function
+        `nma.target.from_numbers`, which returns a blend without `scale`, and then computes `Blend.scale` again if the
+        adapter is `bounded`.
+        """
         return self._framed(from_numbers(flat, self.target), wi)
 
     def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
@@ -217,7 +226,8 @@ class Adapter:
     def numbers(self, params: ArrayLike, cos_theta_i: ArrayLike) -> NDArray[np.float32]:
         """The target's parameters (m, n, size) for m materials (m, columns) and n values of cos(theta_i) (n,).
 
-        Raises `ParamError` for anisotropic adapters.
+        The method calls `prepare`, and then the function `nma.target.numbers`. Raises `ParamError` for anisotropic
+        adapters.
         """
         self.check_isotropic()
         p = np.atleast_2d(np.asarray(params, np.float64))

@@ -1,4 +1,4 @@
-"""Exports the target: as C++ headers, generated from the Python functions that define it, and as Mitsuba BSDFs."""
+"""Exports the target as C++ headers, generated from Python, and a Principled BRDF for Mitsuba's plugin `principled`."""
 
 from nma.export.classes import classes
 from nma.export.cpp import cpp

@@ -1,4 +1,7 @@
-"""Describes a Principled BRDF for Mitsuba's own plugin `principled`: as a dictionary for `mi.load_dict`, or as XML."""
+"""Describes one Principled BRDF with constant parameters for Mitsuba's own plugin `principled`.
+
+The description is a dictionary for `mi.load_dict`, or XML. The plugins that evaluate adapters are in `nma.render`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The header `constants.h` of the C++ runtime: the constants that the runtime shares with this package."""
+"""Prints the generated header `constants.h`: the constants that the C++ runtime shares with this package."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ def ensure_packages(ssim: bool = True) -> None:
 
 
 def _package(name: str) -> Any:
-    """Imports a package of the extra `compare`.
+    """Imports an optional package that only the comparison of images needs.
 
     Raises:
         MissingDependencyError: the package is not installed.

@@ -107,7 +107,7 @@ class Runtime:
 
         Raises:
             ParamError: a parameter is outside the training range or not finite, an array has the wrong shape or length,
-                or an anisotropic adapter got cosines.
+                or `wi` contains cosines although the adapter is anisotropic.
         """
         return self._many("nma_prepare", self._checked(params, clamp), wi, self._brdf)
 

@@ -18,13 +18,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from nma import target
 from nma.adapter import Adapter, shipped, weights_file
 from nma.ops import Color, Vec3, select
 from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.render.curves import MIN_COS, Curves
 from nma.render.inputs import of_adapter
-from nma.target import Brdf
+from nma.target import Brdf, numbers
 
 DEFAULT_ADAPTER = "layered3-5x64"
 ALBEDO_POINTS = 128
@@ -130,6 +129,9 @@ def define() -> type:
             """Returns the BRDF at `si`, which comes from the curves, from the previous call, or else from the
             network."""
             self.inputs.check()
+            # The BRDF is prepared for `si.wi` with its z raised to MIN_COS, because no adapter is evaluated at the
+            # horizon. The parameters of the blend hardly change between cos(theta_i) = 0 and MIN_COS. The BRDF is then
+            # evaluated and sampled for the unchanged `si.wi`, whose half vectors and cosines are exact.
             wi = Vec3(si.wi.x, si.wi.y, dr.clip(si.wi.z, MIN_COS, 1.0))
             if self._curves is not None:
                 return self._curves.at(wi, self.inputs.columns() if self._curves.slopes else [], front)
@@ -138,7 +140,7 @@ def define() -> type:
                 return brdf
             brdf = self.adapter.prepare(self.inputs.columns(si, front), wi, front)
             recording = si.wi.z.state == dr.VarState.Symbolic
-            if recording and not dr.grad_enabled(target.numbers(brdf.blend, self.adapter.target)):
+            if recording and not dr.grad_enabled(numbers(brdf.blend, self.adapter.target)):
                 self._last.keep(query, brdf)
             return brdf
 

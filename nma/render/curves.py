@@ -27,9 +27,12 @@ class Curves:
     """The numbers that describe a blend (`nma.target.numbers`), stored for fixed cosines and linearly interpolated
     between these nodes.
 
-    Every interpolated list of numbers describes a valid blend. Derivatives with respect to the material's parameters
-    come from tables of slopes, because neither forward derivatives nor frozen functions of Dr.Jit could trace the
-    computation of the curves.
+    With curves, rendering does not call `Adapter.prepare`. Only `update` runs the network, once for each node.
+
+    Every interpolated list of numbers describes a valid blend. The numbers do not include `Blend.scale`, so
+    `Adapter.from_numbers` computes the scale of a bounded blend again at each lookup. Derivatives with respect to the
+    material's parameters come from tables of slopes, because neither forward derivatives nor frozen functions of Dr.Jit
+    could trace the computation of the curves.
     """
 
     # Frozen functions of Dr.Jit look for variables in these fields.

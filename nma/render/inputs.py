@@ -164,6 +164,8 @@ def of_adapter(adapter: Adapter, props: Any) -> Inputs:
         whole = known.copy()
         whole[adapter.space.slices[name]] = value
         adapter.check(whole)
+    # The network of this adapter reads only the direction, so the BSDF has no inputs. MEASURED is the class that has no
+    # parameters, whatever the class of the adapter's material is.
     return Inputs(MEASURED, {}, "training")
 
 
@@ -263,7 +265,8 @@ def _read(param: Param, props: Any) -> Any:
 
 
 def _numbers(param: Param, channels: Any) -> Any:
-    """The value of a parameter from the channels of a colour. A parameter with one number accepts only grey colours."""
+    """The value of a parameter from the channels of a colour. A parameter of one number accepts a colour only if the
+    colour is grey, that is, if its channels are equal."""
     if not isinstance(channels, list) or param.size == 3:
         return channels
     if len(set(channels)) > 1:

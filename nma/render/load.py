@@ -34,7 +34,7 @@ def material_bsdf(
     Args:
         material: returned by `nma.materials.load`. This function reads and checks the material's textures.
         model: "nma" (the adapter) or "layered" (the reference).
-        adapter: name of a shipped adapter or a weights file, for "nma".
+        adapter: the name of a shipped adapter, or a weights file. Only the model "nma" uses this argument.
         clamp: whether parameters outside the adapter's training range are clamped to that range instead of rejected.
 
     Raises:

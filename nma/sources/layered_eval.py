@@ -221,8 +221,9 @@ def _scattered(stack: Stack, there: Walk, ways: list[tuple[Vec3, Color]], rng: R
         after = source.step(stack, walk, rng)
         out = Color.of(0.0)
         for d, reached in ways:
-            # The segment began at the coat if `d` points down, else at the conductor. The light travels against `d`,
-            # from the point where it scatters to the interface where the segment began.
+            # The segment began at the coat if `d` points down, and at the conductor if `d` points up. Light travels
+            # along the segment in the direction -d: from the point in the medium where it scatters, to the interface
+            # where the segment began.
             depth = ops.select(d.z < 0, 1.0 - after.height, after.height)
             out = out + reached * (_transmittance(stack, depth, d) / ops.maximum(ops.absolute(d.z), 1e-7))
         found = throughput(walk) * Color(*stack.albedo) * out * _ISOTROPIC_PHASE

@@ -1,4 +1,4 @@
-"""Collections of materials and their tables. A collection is a folder of files, or one file with many materials."""
+"""Lists and tabulates the materials of a collection: a folder of files, or one file with many materials."""
 
 from __future__ import annotations
 

@@ -58,8 +58,8 @@ def tabulate_values(values: Values, *, grid: Grid = ISOTROPIC, points: int = POI
     direction have 32 times as many points, with a density that increases towards the mirror direction, down to the
     scale of the narrowest lobe. Equal arguments give equal tables. The table's `error` is the standard error, estimated
     from four independent sets of points. `error` includes neither rounding nor errors of the source itself, such as the
-    noise of a measurement. The table's `walks` is the number of random walks that would give a bin the same standard
-    error. The number is the median over all bins, and at most 2^40.
+    noise of a measurement. The table's `walks` is an upper bound of the number of random walks that would give a bin
+    the same standard error (`_equal_walks`). The number is the median over all bins, and at most 2^40.
 
     Raises `TableError` for an anisotropic source on an isotropic grid, for a wrong number of points, and for values
     that are not finite.
@@ -174,11 +174,14 @@ def _moments(
 
 
 def _equal_walks(mean: NDArray, error: NDArray, grid: Grid) -> int:
-    """The number of random walks that would give a bin its standard error: the median over all bins."""
+    """An upper bound of the number of random walks that would give a bin its standard error: the median over all bins.
+
+    The number is exact for walks of weight 1. Walks of smaller weights have less noise, so fewer walks would do.
+    """
     noisy = (mean > 0) & (error > 0)
     if not noisy.any():
         return _NOISELESS
-    # For random walks, counting statistics give error^2 = mean * rows / (walks * solid angle).
+    # For random walks of weight 1, counting statistics give error^2 = mean * rows / (walks * solid angle).
     walks = (
         mean[noisy].astype(np.float64) * grid.rows / (error[noisy].astype(np.float64) ** 2 * grid.solid_angle)
     )

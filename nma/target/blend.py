@@ -99,8 +99,8 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
     (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)
     spec_end = spec_start
     clearcoat_end = clearcoat_start
-    # Select the widths of the instance whose interval contains `u_lobe`. The intervals are in the order of the
-    # instances.
+    # Select the microfacet widths (alphas) of the instance to which the selected lobe belongs. Within the specular
+    # lobes and within the clearcoats, the intervals are in the order of the instances.
     for p, (next_x, next_y, next_c) in zip(probabilities, others, strict=False):
         spec_end = spec_end + p.spec
         clearcoat_end = clearcoat_end + p.clearcoat

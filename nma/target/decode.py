@@ -171,7 +171,7 @@ def decode(
     params: Sequence[TargetParam] = PRINCIPLED_PARAMS,
     cos_theta_i: Float = 0.0,
 ) -> Blend:
-    """Converts raw network outputs, `output_size` of them, to a blend.
+    """Converts raw network outputs, `output_size` of them, to a blend. `Adapter.decode` calls this function.
 
     The weights come from stick-breaking: each weight is a fraction of the remainder that the previous weights leave of
     1, and the last weight is the final remainder. `cos_theta_i` is used for parameters that are `in_plane`.
@@ -205,10 +205,10 @@ def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> l
 
 
 def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
-    """The blend as a flat list: all parameters, then all weights except the last.
+    """The blend as a flat list: all parameters, then all weights except the last. The list does not contain `scale`.
 
-    Curves over cos(theta_i) can interpolate these flat lists, because every convex combination of flat lists describes
-    a valid blend.
+    `Adapter.numbers` and the curves of `nma.render` call this function. The curves can interpolate the flat lists,
+    because every convex combination of flat lists describes a valid blend.
     """
     flat: list[Float] = []
     for p in blend.instances:
@@ -219,7 +219,11 @@ def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> 
 
 
 def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> Blend:
-    """The inverse of `numbers`. The number of instances follows from the length of the list."""
+    """The inverse of `numbers`, except that `scale` is 1. `Adapter.from_numbers` calls this function, and then computes
+    `scale` again if the adapter is bounded.
+
+    The number of instances follows from the length of the list.
+    """
     size = instance_size(params)
     n = (len(flat) + 1) // (size + 1)
     if n < 1 or len(flat) != output_size(n, params):

@@ -1,4 +1,7 @@
-"""Fits an adapter to a single material, given as a source of values or as a table (paper Fig. 4, 13)."""
+"""Fits an adapter to a single material of class "measured", given as BRDF values or as a table (paper Fig. 4, 13).
+
+`nma.train.run.fit_material` fits an adapter to a single material of a class with parameters.
+"""
 
 from __future__ import annotations
 

@@ -110,7 +110,12 @@ class PointPool:
 def _evaluated(
     source: Values, mu: NDArray, phi: NDArray, shift: NDArray, points: int
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Evaluates the source in some rows: wo (3, rows, points), weight (rows, points), value (3, rows, points)."""
+    """Evaluates the source at `points` directions wo for each view direction.
+
+    Each view direction is a row: `mu` (rows,) holds cos(theta_i), and `phi` (rows,) the azimuths. `shift` shifts the
+    lattice of each row at random. Returns the directions wo (3, rows, points), their weights (rows, points), and the
+    source's values (3, rows, points).
+    """
     Float = dr.auto.Float
 
     def lanes(x: NDArray) -> Any:

@@ -1,6 +1,7 @@
-"""Fits one Principled BRDF with constant parameters to a material.
+"""Fits one Principled BRDF with constant parameters to a material, for `nma principled`.
 
 The parameters do not depend on the direction, so no network is needed. The result is a single BRDF, not a blend.
+`nma.train.fit` fits an adapter, whose network and blend follow the material more closely.
 """
 
 from __future__ import annotations

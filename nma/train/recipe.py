@@ -21,9 +21,9 @@ class Recipe:
     each row. The step runs the network once per row, and averages the target over `points` points per bin.
 
     - `target`: "principled" has the paper's 11 parameters per instance. "stretched" adds one parameter, which stretches
-      the specular lobe along the plane of incidence. "measured" adds three more parameters, which fade out the specular
-      lobe and flatten the diffuse lobe. "anisotropic" has the parameters of "measured", but stretches lobes along the
-      axes of the surface.
+      the specular lobe along the plane of incidence. "measured" adds three more parameters per instance: one flattens
+      the diffuse lobe, and two fade out the whole instance where the half vector is far from the normal. "anisotropic"
+      has the parameters of "measured", but stretches lobes along the axes of the surface.
     - `grid`: the resolution of the tables.
     - `bounded`: if true, the target is dimmed where it might reflect more light than it receives. Targets that are not
       `directional` are never dimmed.

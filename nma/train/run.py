@@ -1,4 +1,4 @@
-"""Trains an adapter from tables, for a whole class or for one material."""
+"""Trains an adapter from tables: for a whole class (`train_class`), or for one material of a class (`fit_material`)."""
 
 from __future__ import annotations
 

@@ -172,8 +172,9 @@ private:
 
     // The value that this plugin returns to Mitsuba. On a path from the camera, the function returns the argument
     // `value`, which was evaluated with the blend for the view direction `si.wi`. On a path from the light, the view
-    // direction is `wo`, so the function prepares a blend for `wo`. A blend is not reciprocal, so the blend for `si.wi`
-    // would make paths from the light and paths from the camera disagree.
+    // direction is `wo`, so the function prepares a blend for `wo`. If the blend depends on the view direction, it is
+    // not reciprocal, and the blend for `si.wi` would make paths from the light and paths from the camera disagree. If
+    // the blend is constant, the second blend gives the same value, so the function does not test for constant blends.
     Spectrum seen(const BSDFContext& context, const SurfaceInteraction3f& si, const Vector3f& wo,
                   const nma::Vec3<float>& value) const {
         if (context.mode != TransportMode::Importance) return Spectrum(value.x, value.y, value.z);

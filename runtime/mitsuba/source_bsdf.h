@@ -12,6 +12,8 @@ nma::Vec3<float> direction(const Vector& v) {
     return {v.x(), v.y(), v.z()};
 }
 
+// The base class of the BSDFs `nma`, which evaluates an adapter, and `layered`, which simulates the material. Both
+// BSDFs read the parameters of the source material, but only `layered` is a source itself.
 template <class Float, class Spectrum>
 class SourceBSDF : public BSDF<Float, Spectrum> {
 public:

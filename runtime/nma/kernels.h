@@ -104,7 +104,8 @@ struct Kernels {
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
     // `encode` fills in a row of inputs. `decode` computes a blend from `raw`, a row of outputs, and overwrites `raw`.
-    // `set_lobe_probabilities` then completes the blend. `decode` uses wide vectors, and `set_lobe_probabilities` uses
+    // `set_lobe_probabilities` then completes the blend: it fills in the lobe probabilities and, if the adapter is
+    // bounded, the factor `scale`. `decode` uses wide vectors, and `set_lobe_probabilities` uses
     // narrow vectors. Some CPUs run narrow vector instructions at half the speed while wide vector instructions are
     // running. So `prepare_many` calls `decode` for all queries of a block before it calls `set_lobe_probabilities`.
     void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
@@ -132,9 +133,9 @@ inline const Kernels& kernels(InstructionSet set) {
                                   avx2::decode,
                                   avx2::set_lobe_probabilities,
                                   avx2::prepare<avx2::forward>};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_either, avx512::forward_many,
-                                    avx512::encode,         avx512::decode,         avx512::set_lobe_probabilities,
-                                    avx512::prepare_either};
+    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_any, avx512::forward_many,
+                                    avx512::encode,         avx512::decode,      avx512::set_lobe_probabilities,
+                                    avx512::prepare_any};
 #if !defined(NMA_NO_AVX512_BF16)
     static constexpr Kernels BF16{InstructionSet::avx512_bf16,
                                   avx512_bf16::forward,

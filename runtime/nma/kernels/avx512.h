@@ -118,8 +118,9 @@ NMA_OP void run_narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]
     for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
 }
 
-// The function `forward` of `Kernels`. For a narrow network, the activations stay in registers.
-NMA_FN inline void forward_either(const NetworkView& view, const float* inputs, float* outputs) {
+// The function `forward` of `Kernels`, for networks of any width. For a narrow network, `run_narrow` keeps the
+// activations in registers; any other network runs in the function `forward` of body.inl.
+NMA_FN inline void forward_any(const NetworkView& view, const float* inputs, float* outputs) {
     if (!view.narrow) return forward(view, inputs, outputs);
     Vec y[2];
     run_narrow(view, inputs, y);
@@ -141,9 +142,9 @@ NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, cons
     nma::set_lobe_probabilities(blend, wi.z, preparation.bounded);
 }
 
-// The function `prepare` of `Kernels`. For a narrow network, the activations stay in registers.
-NMA_FN inline void prepare_either(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
-                                  Blend<float>& blend) {
+// The function `prepare` of `Kernels`, for networks of any width.
+NMA_FN inline void prepare_any(const Preparation& preparation, const float* parameters, const Vec3<float>& wi,
+                               Blend<float>& blend) {
     if (preparation.network.narrow) return prepare_narrow(preparation, parameters, wi, blend);
     prepare<forward>(preparation, parameters, wi, blend);
 }

@@ -18,6 +18,8 @@
 //
 // The members of `Kernels` point to the functions `forward`, `forward_many`, `encode`, `decode`,
 // `set_lobe_probabilities` and `prepare` below. The other functions in this file are helpers of these six functions.
+// Only for AVX-512, the members `forward` and `prepare` point to `forward_any` and `prepare_any` (avx512.h). These two
+// functions call `forward` and `prepare` below, except for narrow networks.
 
 // Computes VECTORS vectors of neurons for QUERIES queries. `first` is the index of the first of these neurons. Each
 // neuron has SUMS partial sums, because each addition to a single sum would wait for the addition before it. PAIRS says
@@ -138,14 +140,17 @@ NMA_FN NMA_WHOLE inline void encode(const Preparation& preparation, const float*
     preparation.encoding.encode(parameters, wi, inputs, preparation.network.layers[0].in);
 }
 
-// Decodes the raw outputs in place, and fills in the blend except for its lobe probabilities.
+// Decodes the raw outputs in place, and fills in the blend except for its lobe probabilities and its `scale`.
 NMA_FN NMA_WHOLE inline void decode(const Preparation& preparation, float* raw, float cosine, Blend<float>& blend) {
     for (int k = 0; k < preparation.ranges.count; k += VEC_SIZE)
         store(raw + k, decoded(preparation.ranges, k, load(raw + k), 1.0f - cosine * cosine));
     if (preparation.ranges.count <= Few::MOST) assemble(preparation, raw, Few(raw), blend);
     else assemble(preparation, raw, Indexed(raw), blend);
 }
-// Fills in the lobe probabilities of a decoded blend.
+
+// Fills in the lobe probabilities of a decoded blend. If the adapter is bounded, also fills in `scale`, the factor that
+// keeps the blend from reflecting more light than it receives. Both results need the albedo bounds of the lobes, so
+// one function computes both.
 NMA_FN NMA_WHOLE inline void set_lobe_probabilities(const Preparation& preparation, float cosine, Blend<float>& blend) {
     nma::set_lobe_probabilities(blend, cosine, preparation.bounded);
 }

@@ -9,7 +9,8 @@
 
 namespace nma {
 
-// The largest count of inputs or outputs of a layer. Buffers of this size are on the stack.
+// The largest count of inputs or outputs of a layer. Functions allocate arrays of this length on the stack, so that a
+// query allocates no heap memory.
 constexpr int WIDEST_LAYER = 512;
 // The largest count of layers, including the output layer.
 constexpr int DEEPEST_NETWORK = 16;
@@ -31,11 +32,11 @@ constexpr int NARROW = 32;
 //     diagonals  [in][width]      the weights of `columns` in another order, for single queries on AVX-512. Narrow
 //                                 networks have `diagonals` in addition to `columns`.
 //
-// `columns` needs one shuffle instruction for each input x_i, which copies x_i to all lanes of a vector. Column i is
-// multiplied by this vector. If the inputs are in registers, `diagonals` needs fewer shuffles: one shuffle copies four
-// inputs, and four columns are multiplied by the resulting vector. In the following example of four inputs and four
-// neurons, 2>3 is the weight from input 2 to neuron 3. Each column of `diagonals` is a diagonal of the matrix on the
-// left, continued at the other edge:
+// A product with `columns` needs one shuffle instruction for each input x_i, which copies x_i to all lanes of a vector.
+// Column i is multiplied by this vector. If the inputs are already in registers, a product with `diagonals` needs only
+// a quarter of the shuffles: one shuffle repeats four inputs in a vector, and four columns of `diagonals` are
+// multiplied by this vector. In the following example of four inputs and four neurons, 2>3 is the weight from input 2
+// to neuron 3. Each column of `diagonals` is a diagonal of the matrix on the left, continued at the other edge:
 //
 //     `columns`              neuron 0    1    2    3     `diagonals`              lane 0    1    2    3    is added to
 //     column 0, times x0          0>0  0>1  0>2  0>3     column 0, times x0..x3      0>0  1>1  2>2  3>3    sum 0
@@ -60,7 +61,7 @@ struct LayerView {
 
 struct NetworkView {
     int depth;    // count of layers
-    bool narrow;  // whether all layers have the width NARROW, and have `diagonals`
+    bool narrow;  // whether every layer has the padded width NARROW and the array `diagonals`
     LayerView layers[DEEPEST_NETWORK];
 };
 
@@ -70,7 +71,8 @@ struct NetworkView {
 //
 // If in_plane[k] is 1 instead of 0, the decoded value is multiplied by sin^2(theta_i), which goes to 0 towards normal
 // incidence. The arrays have `count` numbers, a multiple of WIDTH_STEP. After the last output of the network, the
-// arrays have at least one zero. From index `logarithmic` on, all factors are 0, so the decoding skips the power of 2.
+// arrays have at least one zero. The numbers factor[k] are 0 for all k >= `logarithmic`. For these k, the decoding does
+// not compute the power of 2.
 struct Ranges {
     int count, logarithmic;
     const float *start, *slope, *factor, *rate, *in_plane;
