@@ -32,7 +32,10 @@ COSINES = (0.9, 0.5, 0.2)
 
 
 class Pairs(NamedTuple):
-    """f(wi, wo) cos(theta_o) and f(wo, wi) cos(theta_o), each (3, n), divided by the probability density of wo."""
+    """Two estimates (3, n) for n pairs of directions, divided by the probability density of wo.
+
+    `forward` is f(wi, wo) cos(theta_o), and `swapped` is f(wo, wi) cos(theta_o).
+    """
 
     forward: NDArray
     swapped: NDArray

@@ -18,7 +18,7 @@ from nma.ops import Float
 # 2015.
 _MIXING = 0.25
 
-# The largest depth and width of a network. A renderer could not run larger networks at every shading point.
+# The largest depth and width of a network. Larger networks would be too slow to run at every shading point.
 _MOST_LAYERS, _MOST_NEURONS = 64, 1024
 
 Layers = list[tuple[Any, Any]]  # for each layer: the matrix (out, in) and the bias (out,)

@@ -247,8 +247,9 @@ private:
     }
 
     // Fills in `Preparation::outputs_of_lanes`. Fields that the network does not set, and lanes without an instance,
-    // get the index of the first output of padding. `Network` pads the last layer by at least one neuron, so there is
-    // an output of padding. The weights and the range of the padding are 0, so the decoded value of the padding is 0.
+    // get the index of the first output of the padding. `Network` pads the last layer by at least one neuron, so the
+    // padding has at least one output. The weights and the range of the padding are 0, so the decoded value of the
+    // padding is 0.
     void lay_out_lanes() {
         const int size = static_cast<int>(places_.size()), per_pack = Blend<float>::PRINCIPLED_SIZE * LANES;
         const int zero = output_count();

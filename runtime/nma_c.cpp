@@ -49,7 +49,8 @@ struct Directions {
     }
 };
 
-// Returns the adapter that `make` returns. If `make` throws, returns null and writes the reason to `message`.
+// Calls `make` with the options of the instruction set, and returns its result as an `nma_adapter`. If `make` throws,
+// returns null and writes the reason to `message`.
 template <class F>
 nma_adapter* loaded(F make, int instruction_set, char* message, size_t size) {
     const auto fail = [&](const char* reason) -> nma_adapter* {

@@ -135,7 +135,8 @@ def case(name, folder):
 def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
     """Derivatives equal finite differences within 1 %, for direct light from one point light.
 
-    The only random numbers are positions in the pixels, which derivatives and differences share.
+    The renderings use random numbers only for positions in the pixels. Derivatives and finite differences use the same
+    random numbers.
     """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}

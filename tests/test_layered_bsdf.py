@@ -260,7 +260,7 @@ def test_light_sampling_equals_bsdf_sampling(monkeypatch):
     alone = measure(scene(32, type="bsdf_sampling"), 512, 8, warmup=False)
     same, worst = same_image(both, alone)
     assert same, worst
-    # The lamp is small, so that sampling it directly must reduce the variance.
+    # The lamp is small, so direct sampling of the lamp must reduce the variance.
     assert 4 * alone.mean_variance > both.mean_variance
 
     evaluate = layered_eval.evaluate

@@ -23,7 +23,7 @@ def test_both_orders_reflect_the_same_over_all_directions():
     both = reciprocity.pairs(random_adapter(), MATERIAL, np.sqrt(rng.random(n)), rng)
     off = both.swapped - both.forward
     assert (np.abs(off.mean(axis=1)) < 4.0 * off.std(axis=1) / n**0.5).all()
-    # For single pairs of directions, swapping changes the value far more than for the mean over all pairs.
+    # Swapping wi and wo changes the values of single pairs of directions far more than the mean over all pairs.
     assert (np.abs(off).mean(axis=1) > 10.0 * np.abs(off.mean(axis=1))).all()
 
 

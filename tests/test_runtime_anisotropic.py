@@ -19,8 +19,8 @@ from nma.ops import Vec3
 
 RUNTIME = Path(__file__).parent.parent / "runtime"
 CASES = 4000
-# With AVX-512, the first network stays in registers and the second network does not. The third network has more inputs
-# (after padding) than neurons per layer.
+# With AVX-512, the activations of the first network stay in registers, and those of the second network do not. The
+# third network has more inputs (after padding) than neurons per layer.
 NETWORKS = ("3x32", "2x64", "1x4")
 
 pytestmark = pytest.mark.usefixtures("compiler")

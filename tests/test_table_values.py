@@ -136,9 +136,9 @@ def test_a_narrow_lobe_of_an_anisotropic_table_folds_to_the_isotropic_one():
 
 
 def test_stated_errors_are_the_spread_of_the_means():
-    """The squared errors of a table are about as large as its stated variance.
+    """The errors of a table are about as large as the standard errors that the table states.
 
-    The errors are the deviations from a table with 16 times as many points.
+    The error of a bin is its difference from the same bin of a table with 16 times as many points.
     """
     source = ggx(0.2)
     tables, better = (tabulate_values(source, grid=Grid(10, 10, 10), points=n) for n in (64, 1024))

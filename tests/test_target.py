@@ -128,7 +128,8 @@ def test_eval_equals_mitsuba_principled():
 def test_clearcoat_distribution_is_normalised(gloss):
     # Rounding in Mitsuba prevents a precise comparison of clearcoats, so that this test checks the scale of the
     # clearcoat's distribution D. The integral of D cos(theta_h) over all half vectors must be 1. With the variable
-    # s = sin^2(theta_h), the integrand is pi D. The variable x = log(s + alpha^2) spreads the peak of D evenly.
+    # s = sin^2(theta_h), the integrand is pi D. Equal steps of the variable x = log(s + alpha^2) sample the peak of D
+    # densely.
     alpha = clearcoat_alpha(gloss)
     low, high = np.log(alpha**2), np.log(1 + alpha**2)
     x = low + (high - low) * (np.arange(20_000) + 0.5) / 20_000

@@ -163,7 +163,8 @@ def judged(library: Library, tables: Tables, path: Path) -> list[dict[str, Any]]
 
 
 def encoding(name: str, library: Library, tables: Tables, steps: int) -> dict[str, Any]:
-    """Learns the latent code of a new material. Returns log loss, most similar material and seconds."""
+    """Learns the latent code of a new material. Returns the log loss, the most similar material of the library, and the
+    time in seconds."""
     began = time.perf_counter()
     found = training.encode(library, tables, recipe=replace(training.ENCODING, steps=steps))
     row = {"name": name, "log_loss": round(found.log_loss, 6), "nearest": found.nearest}

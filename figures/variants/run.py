@@ -45,7 +45,8 @@ def main() -> None:
     data = quick_dataset(kept / "data.zarr") if quick else arguments.data
     validation = common.reference(SET, quick)
     if quick:
-        # With so few steps, compilation with optimisations would take longer than the training.
+        # Optimisations are disabled, because with so few steps the optimised compilation would take longer than the
+        # training.
         jax.config.update("jax_disable_most_optimizations", True)
         validation = validation[:QUICK_VALIDATION]
     name = f"{SET}-{len(validation.params)}x{int(validation.walks[0])}"

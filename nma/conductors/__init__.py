@@ -27,8 +27,8 @@ class Conductors:
         return len(self.names)
 
     def distinct(self) -> np.ndarray:
-        """The row numbers of the distinct metals, ascending. Some substances are in the table twice, under two
-        names."""
+        """The indices of the table's rows in ascending order, without rows that repeat an earlier row. Some substances
+        are in the table twice, under two names."""
         _, first = np.unique(np.hstack([self.eta, self.k]), axis=0, return_index=True)
         return np.sort(first)
 

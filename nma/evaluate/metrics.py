@@ -1,6 +1,7 @@
-"""Error figures of one material's table. Each figure compares f cos(theta_o) [1/sr] and is a mean over bins and RGB.
+"""Error figures of one material's table. Each error figure is a mean over bins and RGB.
 
-`a` is the adapter's table and `b` the reference, both (..., theta_i, theta_o, phi, 3).
+The functions compare two tables of f cos(theta_o) [1/sr]: `a` is the adapter's table and `b` is the reference table,
+both (..., theta_i, theta_o, phi, 3).
 """
 
 from __future__ import annotations

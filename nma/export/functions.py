@@ -1,8 +1,8 @@
 """The functions, structures and constants of the target, as syntax trees.
 
-A function comes after all functions that it calls. The functions use only what every shading language has: assignments
-of expressions to names, arithmetic, comparisons, calls, access to the fields of structures, and one return at the end.
-Any other construct raises an error that names its file and line.
+The list of functions is sorted so that each function comes after all functions that it calls. The functions use only
+what every shading language has: assignments of expressions to names, arithmetic, comparisons, calls, access to the
+fields of structures, and one return at the end. Any other construct raises an error that names its file and line.
 """
 
 from __future__ import annotations

@@ -25,9 +25,9 @@ def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.
         seed: another seed gives another object; equal seeds give equal values.
 
     Returns:
-        The arrays by parameter name. `alpha_bottom` (size, size), in 1e-3..1, is a polished metal with fingerprints and
-        scratches. `sigma_t` (size, size), in 0..1, has patches with soft edges where the pigmented medium is worn off.
-        `albedo` (size, size, 3), in 0..1, has marbled pigments.
+        The arrays by parameter name. `alpha_bottom` (size, size), in 1e-3..1, is the roughness of a polished metal with
+        fingerprints and scratches. `sigma_t` (size, size), in 0..1, has patches with soft edges where the pigmented
+        medium is worn off. `albedo` (size, size, 3), in 0..1, is the colour of marbled pigments.
 
     Raises:
         TextureError: the size is below 16.

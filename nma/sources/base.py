@@ -89,9 +89,9 @@ class Values(Protocol):
         The value is 0 if a direction is below the horizon. The colour is linear sRGB without bounds: a measured colour
         outside the gamut has a negative channel.
 
-        Lanes are float32. The type of the lanes may be a differentiable type of Dr.Jit, but `eval` does not propagate
-        derivatives. Dr.Jit may trace the call into a kernel, so `eval` must not read the values of lanes or branch on
-        them.
+        The numbers in the lanes are float32. Their type may be a differentiable type of Dr.Jit, but `eval` does not
+        propagate derivatives. Dr.Jit may trace the call into a kernel, so `eval` must not read the values of lanes or
+        branch on them.
         """
         ...
 

@@ -19,9 +19,9 @@ from nma.ops import Float
 class Lookup:
     """A regular grid in d dimensions, whose `cells` are an array of shape (n_1, ..., n_d, channels).
 
-    A position is measured in cells: 0 .. n_k in dimension k. A `periodic` dimension wraps around. In any other
-    dimension, a position beyond an end is replaced by the position of that end. Positions may be of Dr.Jit types with
-    or without derivatives, so that tabulation and rendering can use the same grid.
+    A position is measured in cells: 0 .. n_k in dimension k. A `periodic` dimension wraps around. In a dimension that
+    is not periodic, a position below 0 is replaced by 0, and a position above n_k by n_k. Positions may be of Dr.Jit
+    types with or without derivatives, so that tabulation and rendering can use the same grid.
     """
 
     def __init__(self, cells: NDArray, periodic: Sequence[bool]):

@@ -89,7 +89,8 @@ def _near_mirror(bins: NDArray, grid: Grid) -> NDArray[np.bool_]:
     i, a, o, b = _indices(bins, grid)
     near_o = _apart(i, grid.theta_i, o, grid.theta_o) < _REACH
     # If both directions are close to the normal, the half vector is close to the normal, too, whatever the azimuths
-    # are. So bins close to the normal count as near the mirror direction at every azimuth.
+    # are. So, if theta_i and theta_o are in the bins nearest to the normal, wo counts as near the mirror direction at
+    # every azimuth.
     top = (i == grid.theta_i - 1) & (o == grid.theta_o - 1)
     if not grid.phi_i:
         return near_o & (b >= grid.phi_o - 2) | top
@@ -130,8 +131,9 @@ def _means(
         raise TableError(f"{values.name}: has values that are not finite, first in bin {place}")
     weight, square, value, product = sets[..., :1], sets[..., 1:2], sets[..., 2:5], sets[..., 5:]
     # The weights serve as a control variate, because their expected value is known to be 1. If the mean weight of a set
-    # is not 1, the mean value of the set has an error that is correlated with the deviation. The correlated part of the
-    # error is subtracted. If the source hardly changes within a bin, the mean value becomes almost exact.
+    # is not 1, the mean value of the set has an error that is correlated with the difference of the mean weight from 1.
+    # The correlated part of the error is subtracted. If the source hardly changes within a bin, the mean value becomes
+    # almost exact.
     variance = np.mean(square - weight * weight, axis=0)
     covariance = np.mean(product - weight * value, axis=0)
     slope = np.where(variance > _UNWEIGHTED, covariance / np.maximum(variance, _UNWEIGHTED), 0.0)

@@ -143,8 +143,8 @@ def _check(p: TargetParam) -> None:
 
 
 def limits(field: str) -> tuple[float, float]:
-    """The range on which a field of `Principled` is defined, which must contain the range of the field's
-    `TargetParam`."""
+    """The range on which a field of `Principled` is defined. The range of the field's `TargetParam` must lie within
+    this range."""
     return _LIMITS.get(field, (0.0, 1.0))
 
 

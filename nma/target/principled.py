@@ -195,8 +195,8 @@ def spec_fresnel(p: Principled, cos: Float, cos2: Float, weight: Float) -> Terms
     """
     tinted = (1.0 - p.metallic) * p.spec_tint
     plain = (1.0 - p.metallic) - tinted
-    # The metal and the tinted dielectric use Schlick's F0 + (1 - F0) weight. The variable f0 is the sum of their F0,
-    # weighted with `metallic` and `tinted`.
+    # The metal and the tinted dielectric use Schlick's F0 + (1 - F0) weight. The variable f0 is the sum of F0 of the
+    # metal times `metallic` and F0 of the tinted dielectric times `tinted`.
     f0 = p.metallic + tinted * specular_f0(p.specular) * luminance_inverse(p.base_color)
     white = (
         plain * dielectric_reflectance(cos, cos2, specular_eta(p.specular)) + (p.metallic + tinted) * weight

@@ -29,8 +29,9 @@ from nma.train.recipe import Recipe
 
 # Number of directions wi of the pool (its rows), and number of directions wo for each direction wi.
 ROWS, POINTS = 8192, 512
-# One of `_CROWDED` directions wo is drawn near the mirror direction; the other directions are uniform. A share of a
-# quarter is enough to find narrow lobes. With a larger share, smooth parts of the material would be fitted worse.
+# One of `_CROWDED` directions wo is drawn near the mirror direction; the other directions are uniform. A quarter of the
+# directions is enough to find narrow lobes. If more directions were near the mirror direction, smooth parts of the
+# material would be fitted worse.
 _CROWDED = 4
 # Widths (alpha) of the microfacet lobes from which the directions near the mirror direction are drawn.
 _WIDTHS = tuple(0.0005 * 2.0**k for k in range(11))

@@ -151,9 +151,9 @@ def _judge(adapter: Adapter, tables: Tables) -> _Judged:
 
 
 def _starts(tables: Tables) -> NDArray[np.float32]:
-    """Encoded parameters (starts, outputs) of all starting points.
+    """The starting points of the fit, as encoded parameters (starts, outputs).
 
-    The base colour of all starting points is the table's mean albedo.
+    The base colour of every starting point is the table's mean albedo.
     """
     base_color = Color(*np.clip(tables.albedo()[0].mean(axis=0), 0.02, 0.98))
     blends = [Blend((p._replace(base_color=base_color),), (1.0,)) for p in _STARTS.values()]
@@ -161,7 +161,10 @@ def _starts(tables: Tables) -> NDArray[np.float32]:
 
 
 def _objective(raw: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:
-    """The sum of the losses of all fits, which are independent of each other, and the log loss of the best fit."""
+    """Returns the sum of the losses of all fits, and the log loss of the best fit.
+
+    The fits are independent of each other, so minimising the sum minimises each loss.
+    """
 
     def one(numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
         return brdf_loss(Brdf(target.decode(list(numbers), 1, CONSTANT_PARAMS)), batch, recipe)

@@ -90,9 +90,9 @@ private:
         throw Error(WRONG_CLASS);
     }
 
-    // The position to which `encode` writes input i of the encoding `layered3`. In the order of training, the inputs
-    // are four scalars s0 .. s3, three colours (r, g, b) and three numbers d0 .. d2 that depend on the direction.
-    // `encode` computes vectors of four lanes, so each colour gets one of the numbers d0 .. d2 as its fourth lane:
+    // The position to which `encode` writes input i of the encoding `layered3`. The network was trained with its inputs
+    // in this order: four scalars s0 .. s3, three colours (r, g, b), and three numbers d0 .. d2 that depend on the
+    // direction. `encode` computes vectors of four lanes, so it appends one of the numbers d0 .. d2 to each colour:
     //
     //     order of training    s0 s1 s2 s3  r0 g0 b0  r1 g1 b1  r2 g2 b2  d0 d1 d2
     //     order of `encode`    s0 s1 s2 s3  r0 g0 b0 d0  r1 g1 b1 d1  r2 g2 b2 d2

@@ -164,7 +164,8 @@ struct Way {
     Vec direction, reached;
 };
 
-// One segment of a walk, chosen from all segments except the first by weighted reservoir sampling (Chao 1982).
+// One segment of a walk. Weighted reservoir sampling (Chao 1982) chooses this segment at random from all segments of
+// the walk, except that the first segment is never chosen.
 struct Detour {
     Vec direction, tint{0.0f, 0.0f, 0.0f};
     float total = 0.0f;

@@ -32,10 +32,10 @@ constexpr int NARROW = 32;
 //     diagonals  [in][width]      the weights of `columns` in another order, for single queries on AVX-512. Narrow
 //                                 networks have `diagonals` in addition to `columns`.
 //
-// A product with `columns` needs one shuffle instruction for each input x_i, which copies x_i to all lanes of a vector.
-// Column i is multiplied by this vector. If the inputs are already in registers, a product with `diagonals` needs only
-// a quarter of the shuffles: one shuffle repeats four inputs in a vector, and four columns of `diagonals` are
-// multiplied by this vector. In the following example of four inputs and four neurons, 2>3 is the weight from input 2
+// A product with `columns` needs one shuffle instruction for each input x_i. The instruction copies x_i to all lanes of
+// a vector, by which column i is multiplied. If the inputs are already in registers, a product with `diagonals` needs
+// only about a quarter of the shuffles: one shuffle repeats four inputs in a vector, by which four columns of
+// `diagonals` are multiplied. In the following example of four inputs and four neurons, 2>3 is the weight from input 2
 // to neuron 3. Each column of `diagonals` is a diagonal of the matrix on the left, continued at the other edge:
 //
 //     `columns`              neuron 0    1    2    3     `diagonals`              lane 0    1    2    3    is added to
