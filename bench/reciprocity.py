@@ -32,9 +32,9 @@ COSINES = (0.9, 0.5, 0.2)
 
 
 class Pairs(NamedTuple):
-    """Two estimates (3, n) for n pairs of directions, divided by the probability density of wo.
+    """Values (3, n) of f at n pairs of directions, divided by the probability density of wo.
 
-    `forward` is f(wi, wo) cos(theta_o), and `swapped` is f(wo, wi) cos(theta_o).
+    `forward` is f(wi, wo) cos(theta_o) / density, and `swapped` is f(wo, wi) cos(theta_o) / density.
     """
 
     forward: NDArray
@@ -85,7 +85,10 @@ def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[
 
 
 def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Generator) -> Pairs:
-    """Samples the adapter's blend: one light direction for each view direction, which is given by its cosine."""
+    """Draws one light direction from the adapter's blend for each view direction.
+
+    `cosines` (n,) are the cosines of the view directions with the normal.
+    """
     n = len(cosines)
     wi = at_azimuth_0(cosines)
     brdf = prepared(adapter, params, wi)

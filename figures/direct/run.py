@@ -148,8 +148,8 @@ def of_evaluator(trained: direct.Evaluator) -> Evaluate:
 
 
 def batched(at_points: Callable[[Any, Vec3, Vec3], jax.Array]) -> Callable[[Any, Vec3, Vec3], NDArray]:
-    """Compiles `at_points`, and returns a function that applies it to all points in batches that fit into a CPU's
-    cache."""
+    """Compiles `at_points`, and returns a function that calls the compiled function for all points, in batches that fit
+    into a CPU's cache."""
 
     @jax.jit
     def compiled(material: Any, wi: Vec3, wo: Vec3) -> jax.Array:

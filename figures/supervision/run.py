@@ -7,7 +7,7 @@ experiment fits a 3x32 network, whose only input is the view direction, to a smo
 All fits to one material use the same table, steps and learning rate. In all columns except the last, the fits differ
 only in the points. These fits use the paper's loss, and a target with the paper's parameters that is also bounded, so
 that it reflects no more light than it receives. The fit in the last column uses the settings of `nma fit`, except for
-the steps and the schedule of the learning rate. Every fit is compared with an independent table and rendered.
+the number of steps and the schedule of the learning rate. Every fit is compared with an independent table and rendered.
 
 Writes supervision.json and supervision.png beside this file. With --quick, makes three short fits and writes to
 out/figures/supervision.

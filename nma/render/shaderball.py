@@ -130,7 +130,10 @@ def _scratch_folder() -> Path:
 
 
 def _arc(radius: float | Array, start: float, stop: float, count: int = 2000) -> Array:
-    """Points (radius, height) (count, 2) of an arc at polar angles from `start` to `stop`. `radius` may be an array."""
+    """Returns the points of an arc as an array (count, 2) of pairs (radius, height).
+
+    The polar angles of the points go from `start` to `stop`. `radius` may be an array.
+    """
     theta = np.linspace(start, stop, count)
     return np.stack([radius * np.sin(theta), radius * np.cos(theta)], axis=-1)
 

@@ -164,8 +164,8 @@ struct Way {
     Vec direction, reached;
 };
 
-// One segment of a walk. Weighted reservoir sampling (Chao 1982) chooses this segment at random from all segments of
-// the walk, except that the first segment is never chosen.
+// One segment of a walk, chosen at random from all but the first segment. The choice is weighted reservoir sampling
+// (Chao 1982).
 struct Detour {
     Vec direction, tint{0.0f, 0.0f, 0.0f};
     float total = 0.0f;
@@ -215,8 +215,8 @@ inline float mirror_pdf(const Vec& w, const Vec& out, float alpha) {
 //
 // The light enters through the coat, hits the conductor once or more, and leaves through the coat. The walk `there`
 // starts at wi, and the walk `back` starts at wo. Each refraction or reflection on the light path is an event. The
-// walks draw all events at random except one, the connection, where the two walks are joined. The density of the
-// connection is evaluated instead.
+// walks draw all events at random except one, the connection, where the two walks are joined. Both directions at the
+// connection are known, so its density is evaluated.
 //
 // The connection is either the last hit of the conductor or the exit through the coat. `evaluate` calls this function a
 // second time with wi and wo exchanged and `forward` false. In the second call, the connection is the first hit or the

@@ -14,8 +14,9 @@ namespace nma {
 constexpr int WIDEST_LAYER = 512;
 // The largest count of layers, including the output layer.
 constexpr int DEEPEST_NETWORK = 16;
-// WIDTH_STEP is the count of lanes of the widest vector, and every width is a multiple of it. INPUT_STEP is the count
-// of inputs that the inner loop of `tile` (body.inl) reads per step, and every count of inputs is a multiple of it.
+// WIDTH_STEP is the count of lanes of the widest vector. Every width is a multiple of WIDTH_STEP. INPUT_STEP is the
+// count of inputs that the inner loop of `tile` (body.inl) reads per step. Every count of inputs is a multiple of
+// INPUT_STEP.
 constexpr int WIDTH_STEP = 16, INPUT_STEP = 4;
 // The width of a narrow network. The activations of such a network fit in two vectors of 16 lanes and stay in
 // registers.
