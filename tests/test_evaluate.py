@@ -285,7 +285,8 @@ def test_counting_errors_are_exact_for_walks_of_throughput_1():
     """If all walks have throughput 1, the standard deviation of a bin is the value of `counting_error`, within 5 %.
 
     The count of walks in a bin is binomial, and eq. 9 of the paper converts the count to the value of the bin.
-    `counting_error` leaves out the factor sqrt(1 - p) of the binomial, where p is the probability of the bin.
+    The standard deviation of the binomial distribution has the factor sqrt(1 - p), where p is the probability of the
+    bin. `counting_error` leaves out this factor.
     """
     rows, walks, omega = 4, 4_000_000, 2.0 * math.pi / 100
     chance = np.array([0.001, 0.01, 0.05])

@@ -40,10 +40,10 @@ def pool_of(source, **sizes):
 
 
 def test_weighted_points_are_uniform_over_the_hemisphere():
-    """For every wi, the weighted mean of a function over the points is its mean over the hemisphere of wo.
+    """For every wi, the weighted mean of a function over the points equals the function's mean over all directions wo.
 
-    The points near peaks are denser than elsewhere, so that they have smaller weights. A failure means that fits are
-    biased towards some directions.
+    The points near peaks are denser than elsewhere, so they have smaller weights. A failure means that fits are biased
+    towards some directions.
     """
     pool = pool_of(LAMBERT)
     z, x = pool.wo[2], pool.wo[0]

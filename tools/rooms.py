@@ -52,7 +52,7 @@ def _room(module: str) -> str:
 
 
 def reduced(arrows: frozenset[Arrow]) -> frozenset[Arrow]:
-    """Removes every arrow from A to B for which other arrows form a path from A to B. There must be no cycles."""
+    """Removes every arrow from A to B for which other arrows form a path from A to B. The arrows must form no cycle."""
 
     @cache
     def below(room: str) -> frozenset[str]:

@@ -44,8 +44,8 @@ CAMERAS: dict[str, Camera] = {
 
 PAPER_SIZE = 240.0  # side length of the floor, whose edge lies far beyond the pattern
 PAPER_PATTERN = 24.0  # side length of the part with the pattern, around the ball
-# For each lighting: the paper's reflectance far from the ball, how much higher the reflectance is near the ball, and
-# the contrast of the pattern.
+# For each lighting: the reflectance of the graph paper far from the ball, how much higher the reflectance is near the
+# ball, and the contrast of the pattern.
 PAPER_TONE = {"outdoors": (0.60, 0.25, 1.0), "studio": (0.08, 0.45, 0.5)}
 
 

@@ -4,7 +4,7 @@ shell stands.
 Every part is a solid of revolution. Texture coordinate u runs around the axis, and v runs along the profile. At a pole
 all values of u meet in one point, so the axes are chosen such that no pole faces the default camera.
 
-The shell's outer radius is 1. The ring stands on the plane z = 0, and z is up.
+The shell's outer radius is 1. The z axis points up, and the ring that carries the shell stands on the plane z = 0.
 """
 
 from __future__ import annotations

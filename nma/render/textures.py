@@ -44,11 +44,11 @@ def procedural_textures(size: int = 512, seed: int = 0) -> dict[str, NDArray[np.
 
 
 def periodic_noise(rng: np.random.Generator, size: int, *, period: float, slope: float = 2.0) -> Array:
-    """Smooth noise that tiles: (size, size), mean 0, standard deviation 1.
+    """Smooth periodic noise: (size, size), mean 0, standard deviation 1.
 
     White noise is filtered in the frequency domain: the amplitude is constant up to the frequency 1/period, and then
-    falls with frequency^-slope. The noise tiles because all frequencies are whole numbers of cycles per tile. Equal
-    seeds give the same pattern at every size.
+    falls with frequency^-slope. The noise continues without a seam across the border of the texture, because each
+    frequency is a whole number of cycles per texture. Equal seeds give the same pattern at every size.
 
     Args:
         period: size of the largest features, as a fraction of the texture's width.

@@ -99,7 +99,8 @@ def _enter(stack: Stack, w: Vec3, rng: Random) -> Walk:
 
 
 def _crossing(stack: Stack, walk: Walk) -> Walk:
-    """The walk after it has crossed the whole slab: the slab's transmittance multiplies its throughput."""
+    """Returns the walk after it has crossed the whole slab. The walk's throughput is multiplied by the slab's
+    transmittance."""
     dimmed = throughput(walk) * _transmittance(stack, 1.0, Vec3(*walk.direction))
     return replace(walk, throughput=tuple(dimmed))
 

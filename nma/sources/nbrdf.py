@@ -28,7 +28,7 @@ SIZES = (6, 21, 21, 3)
 WEIGHTS = sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(SIZES[:-1], SIZES[1:], strict=True))
 
 # There are two published sets of networks. Each key is a material that only one of the sets contains, and its value is
-# the name of that set. A weights file with this material belongs to the set.
+# the name of that set. If a weights file contains the material, its networks are of that set.
 _FITTED_TO = {"alum-bronze": "NBRDF-MERL", "cc_ibiza_sunset_rgb": "NBRDF-RGL"}
 
 

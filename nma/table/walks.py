@@ -127,7 +127,7 @@ def _mix(x: Any) -> Any:
 
 @dataclass
 class _State:
-    """The state of a lane in its sweep.
+    """The state of the loop in which each Dr.Jit lane simulates its walks.
 
     A lane starts its next walk as soon as the previous walk has ended, so no lane idles.
     """

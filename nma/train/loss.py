@@ -95,8 +95,8 @@ def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
     """The squared error of the directional albedo, times its weight in the recipe."""
     if not recipe.albedo > 0:
         return 0.0
-    # The square of a noisy estimate's error would contain the variance of the estimate. The expected product of the
-    # errors of two independent estimates does not contain their variance.
+    # The loss is the product of the errors of two independent estimates, because the expected product does not contain
+    # the variance of the estimates. The squared error of a single estimate would contain the variance.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
     return recipe.albedo * (first * second).mean()
 

@@ -1,8 +1,8 @@
 """Training data for sources whose values are known (`Values`): their values at pairs of directions.
 
 A table has only the averages over bins, so for a table the target must be averaged, too, by default over 8 points per
-bin. A source with known values is compared with the target at single pairs of directions, which needs one evaluation of
-the target instead of 8.
+bin. A source with known values is compared with the target at single pairs of directions, so each comparison needs only
+one evaluation of the target.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ private:
         return {drawn, weight};
     }
 
-    // Simulates a walk, and writes the direction in which it leaves to `drawn`. Returns the walk's throughput.
+    // Simulates a walk, writes the walk's final direction to `drawn`, and returns the walk's throughput.
     // `drawn.pdf` is close to the unknown density of the walk's direction.
     static Spectrum walked(const View& view, const SurfaceInteraction3f& si, Float u, const Point2f& u2,
                            BSDFSample3f& drawn) {

@@ -30,7 +30,7 @@ public:
     explicit TexelFinder(Object& texture) { put_object("", &texture, 0); }
 
     std::vector<Texels> found;
-    // Whether every texture exposed numbers. Mesh attributes, for example, have no numbers before rendering.
+    // Whether the numbers of every texture were found. Mesh attributes, for example, have no numbers before rendering.
     bool complete = true;
 
 protected:
