@@ -14,7 +14,8 @@ another material, so its error is not computed.
 
 Every run renders one frame with each BSDF. In a vectorised renderer, the measured time excludes the compilation of
 kernels. But the measured time includes the tracing of the BSDF in Python, about 0.05 s per frame for the larger
-network. In frames smaller than the default size, tracing would therefore make the adapters look slower.
+network. In frames smaller than the default size, the adapters would look slower, because tracing would take a larger
+part of the measured time.
 
 Writes settings.json, settings.md (the table) and settings.png (efficiencies by error).
 """

@@ -116,7 +116,8 @@ def nested(depth):
         (changed("layered3-3x32", target=[]), "target parameters must have a base_color, and no name twice"),
         (changed("layered3-3x32", target=[BASE_COLOR]), "does not fit its description"),
         (changed("layered3-3x32", target=[*TARGET[:3], *TARGET[1:]]), "base_color, and no name twice"),
-        # `sheen` occurs twice and `sheen_tint` is missing, so that the number of outputs is correct.
+        # `sheen` occurs twice and `sheen_tint` is missing. The number of outputs is still correct, so the file passes
+        # the check of this number.
         (
             changed("layered3-3x32", target=[*TARGET[:6], TARGET[5], *TARGET[7:]]),
             "base_color, and no name twice",

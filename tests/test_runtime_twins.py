@@ -259,7 +259,7 @@ def test_a_brdf_has_the_size_that_the_readme_says(bridge):
 def test_a_brdf_for_c_is_hardly_larger_than_a_brdf(bridge):
     """The C type of a BRDF is at most 16 bytes larger than the C++ type.
 
-    The compiler checks that the C type is not smaller.
+    The compiler checks that the C type is not smaller than the C++ type.
     """
     runtime = Runtime("layered3-3x32")
     assert 0 <= runtime._c.nma_brdf_size() - bridge.brdf_size() <= 16

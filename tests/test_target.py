@@ -281,7 +281,7 @@ def test_derivatives_equal_finite_differences():
 
 
 def test_single_precision_keeps_its_digits():
-    """Dr.Jit and JAX in single precision equal NumPy in double precision within 2e-5 relative, also in the peaks.
+    """Dr.Jit and JAX in single precision equal NumPy in double precision within a factor of 1 +- 2e-5, even in peaks.
 
     NumPy, Dr.Jit and JAX get the same inputs, which are rounded to single precision.
     """

@@ -28,8 +28,8 @@ STRUCTURES: tuple[type, ...] = (
     albedo.Albedos,
     plane.Plane,
 )
-# A function comes after all functions that it calls. The method `of` of the structure `Plane` becomes the function
-# `plane_of`.
+# In this list, a function comes after all functions that it calls. The method `of` of the structure `Plane` becomes the
+# function `plane_of`.
 FUNCTIONS: tuple[Callable, ...] = (
     microfacet.ggx_d,
     microfacet.smith_g1,

@@ -80,8 +80,8 @@ def _smoothstep(low: float, high: float, x: Array) -> Array:
 
 
 def _worn_metal(rng: np.random.Generator, size: int) -> Array:
-    """Microfacet widths alpha (size, size): polished metal with fingerprints, scratches and dull clouds. The patterns
-    are added in log10(alpha)."""
+    """Microfacet widths alpha (size, size): polished metal with fingerprints, scratches and dull clouds. The function
+    combines the logarithms of alpha of the patterns."""
     clouds = periodic_noise(rng, size, period=0.35, slope=2.2)
     log_alpha = -1.35 + 0.28 * clouds
     log_alpha += 0.55 * _finger_prints(rng, size)

@@ -101,8 +101,8 @@ class Layered3:
         tint = fresnel_conductor_rgb(cos_m, Color(*params.eta_bottom), Color(*params.k_bottom))
         weight = ops.select(at_bottom, tint, Color.of(1.0)) * smith_g1(out, alpha, alpha)
         weight = ops.select(valid, weight, Color.of(0.0))
-        # Return to the slab's frame. For a walk that hits the coat from below, the normal pointed down, so z changes
-        # its sign.
+        # Convert the direction to the slab's frame, in which z points up. In the frame used above, z points down for
+        # a walk that hits the coat from below, so the sign of z changes for this walk.
         out = Vec3(out.x, out.y, dr.select(upward, -out.z, out.z))
 
         # In the medium, scatter isotropically.

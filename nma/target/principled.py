@@ -5,8 +5,9 @@ CONVENTIONS.md says, directions are in the local frame, where z is up, `wi` poin
 the light. Values are f cos(theta_o).
 
 Deliberate differences from Mitsuba's plugin, all of them small:
-- Narrow peaks are more precise. GGX and GTR1 are computed from the components of the half vector, never from 1 +
-  (alpha^2 - 1) cos^2. In single precision Mitsuba's clearcoat is wrong by several per cent at alpha .001.
+- Values in narrow peaks have smaller rounding errors. GGX and GTR1 are computed from the components of the half vector,
+  never from 1 + (alpha^2 - 1) cos^2. In single precision, Mitsuba's clearcoat of alpha .001 is wrong by several per
+  cent.
 - `specular` may vary over the surface, and `specular` = 0 removes only the dielectric reflection. In Mitsuba,
   `specular` = 0 also removes the reflection of metals.
 - The cosine between a direction and the half vector is computed as |wi + wo| / 2, the same for both directions. Mitsuba

@@ -38,7 +38,8 @@ struct Input {
     // Whether the input may differ between points of the surface. A texture whose numbers are not known before
     // rendering, such as a mesh attribute, may differ even if Mitsuba's `is_spatially_varying` returns false.
     bool varies() const { return texture && (!known || texture->is_spatially_varying()); }
-    // Whether the input is a texture that is the same at all points. The texture object may have other owners.
+    // Whether the input is a texture that is the same at all points. Other objects of the scene may use the same
+    // texture object.
     bool shared() const { return texture && !varies(); }
 
     // The numbers of the texture at `si`, which are not checked.

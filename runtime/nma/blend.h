@@ -131,8 +131,8 @@ inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Ve
     return result;
 }
 
-// The index of the instance that `u` chooses. From `start` on, each instance has an interval whose length is the
-// probability of its `lobe`. The chosen instance is the one whose interval contains `u`. Moves `start` to the end of
+// Returns the index of the instance whose interval contains the uniform number `u`. The intervals are consecutive and
+// begin at `start`. The length of an instance's interval is the probability of its `lobe`. Moves `start` to the end of
 // the chosen interval. Returns `count` if `u` lies beyond all intervals.
 template <class T>
 inline int chosen(const Blend<T>& blend, Lanes<T> LobeProbabilities<Lanes<T>>::* lobe, T u, T& start) {
