@@ -64,8 +64,8 @@ def simulation(subject: Subject) -> dict[str, Any]:
 def adapter(subject: Subject, name: str, clamp: bool = False) -> dict[str, Any]:
     """Returns the BSDF `nma` of a shipped adapter or a weights file.
 
-    Without textures, the BSDF interpolates curves over the viewing angle. With textures, the BSDF runs the network at
-    every shading point.
+    Without textures, the BSDF interpolates curves over cos(theta_i). With textures, the BSDF runs the network at every
+    shading point.
     """
     return material_bsdf(subject.material, "nma", adapter=name, clamp=clamp) | subject.images()
 

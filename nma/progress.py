@@ -69,8 +69,10 @@ class TrainingBar:
 def of_training(
     given: Callable[[Any], None] | None, recipe: Any, title: str = "training"
 ) -> Iterator[Callable[[Any], None]]:
-    """Yields the function that training calls to report its progress. The function is `given`, unless `given` is None.
-    Without `given`, the function updates a progress bar if stderr is a terminal, and otherwise does nothing.
+    """Yields the function that training calls to report its progress, which is the function `given` of the caller.
+
+    If `given` is None, yields a function that updates a progress bar if stderr is a terminal, and otherwise does
+    nothing.
     """
     if given is not None:
         yield given

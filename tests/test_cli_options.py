@@ -122,7 +122,7 @@ def test_the_version_is_printed(nma):
 def test_a_terminated_command_deletes_its_partial_files(tmp_path):
     """If a command gets the signal SIGTERM, it deletes partly written files and ends, as on Ctrl-C.
 
-    A job queue or a system that shuts down sends this signal.
+    Job queues send SIGTERM to stop a job, and a system sends SIGTERM when it shuts down.
     """
     code = """
 import sys, time

@@ -151,8 +151,8 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
 def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
     """Derivatives equal finite differences within four standard errors over 8 seeds, with indirect light.
 
-    Sampling makes derivatives and differences noisy. The false-alarm rate over all comparisons together is .007, by
-    Student's t.
+    Random sampling makes derivatives and differences noisy, so they are compared by t-tests. The false-alarm rate over
+    all comparisons together is .007.
     """
     bsdf, directions = case(name, tmp_path)
     directions = {f"material.{key}": d for key, d in directions.items()}

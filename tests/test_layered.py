@@ -114,7 +114,7 @@ def test_integral_of_rough_coat_over_white_conductor():
     """The albedo at cos(theta_i) = .9 is .556, to three digits.
 
     This rough coat over a conductor is a hard case. In pbrt-v4 (its function `f`) and in the code published with Guo,
-    Hasan and Zhao 2018 (its bidirectional evaluation), evaluation and random walks disagree about its albedo.
+    Hasan and Zhao 2018 (its bidirectional evaluation), evaluation and random walks give different albedos.
     """
     n = 1 << 20
     _, weight = estimates(layers_of(CASES["white_coated"], n), fixed(0.9, n), random(n, 5))

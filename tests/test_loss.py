@@ -166,9 +166,9 @@ def exact_albedo(raw, mu):
 def test_albedos_and_their_derivatives_are_unbiased(tables):
     """Estimates of albedos and their derivatives have the means that quadrature gives (t-tests).
 
-    An estimate consists of two independent halves. The mean of the product of the halves is the squared albedo. The
-    false-alarm rate is `FALSE_ALARM` over all comparisons. A failure means that training makes albedos differ from the
-    albedos of the tables.
+    Each estimate consists of two independent estimates, the halves, so the mean of the product of the two halves is the
+    squared albedo. The false-alarm rate is `FALSE_ALARM` over all comparisons. A failure means that training makes
+    albedos differ from the albedos of the tables.
     """
     blocks, rows = 40, 32
     recipe = replace(TINY, encoding="direction", directional=False, rows=rows, albedo_samples=8)

@@ -47,7 +47,7 @@ def planes():
 
 
 def inner_cells(n=2000, seed=1):
-    """Returns random cells. In the middle of each cell, both directions are above the horizon."""
+    """Returns random cells of the MERL grid. In the middle of each cell, both directions are above the horizon."""
     rng = np.random.default_rng(seed)
     h, d, p = rng.integers(0, 60, n), rng.integers(0, 40, n), rng.integers(0, 180, n)
     light, view = at(h + 0.5, d + 0.5, p + 0.5)

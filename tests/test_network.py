@@ -64,9 +64,8 @@ def test_initial_layers_have_the_spread_of_their_law():
     """Initial weights have the standard deviation of He et al. 2015.
 
     With this standard deviation, the outputs of a layer are about as large as its inputs. The weights of the last layer
-    are ten times smaller.
-
-    The last bias is the given array, and equal seeds give equal layers.
+    have a tenth of this standard deviation. The bias of the last layer is the given array, and equal seeds give equal
+    layers.
     """
     layers = network.init(np.random.default_rng(0), [200, 300, 100], np.arange(100))
     assert layers[0][0].std() == pytest.approx(np.sqrt(2.0 / 200), rel=0.02)

@@ -165,8 +165,9 @@ def scores(bridge, estimator, params, tables, per_row=1 << 18, seed=5):
     """Returns |z| of the difference between a table in C++ and a table of the package's walks.
 
     `estimator` says whether C++ fills its table from walks ("walk") or estimates ("estimate"). Estimates are compared
-    only in bins with a relative error below 3 %. If the coat is rough and the conductor is smooth, a few bright samples
-    may dominate bins with larger errors. If no bright sample is drawn, the stated error of the bin is too small.
+    only in bins with a relative error below 3 %. The reason is that a few bright samples may dominate the other bins if
+    the coat is rough and the conductor is smooth. If no bright sample is drawn, the stated error of such a bin is too
+    small.
     """
     sums, squares = np.zeros((2, *GRID.shape))
     about = np.ascontiguousarray(params, np.float32)

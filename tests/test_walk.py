@@ -162,7 +162,7 @@ def test_rough_coat_over_white_conductor():
     """The albedo of a rough coat over a white conductor at cos(theta_i) = .9 is .556, to three digits.
 
     This rough coat over a conductor is a hard case. In pbrt-v4 (its function `f`) and in the code published with Guo,
-    Hasan and Zhao 2018 (its bidirectional evaluation), evaluation and random walks disagree about its albedo.
+    Hasan and Zhao 2018 (its bidirectional evaluation), evaluation and random walks give different albedos.
     """
     found, error = albedo(0.9, 1 << 20, eta_top=1.5, alpha_top=0.2, alpha_bottom=0.4, **WHITE)
     assert_equal_means(found, error + 0.5e-3 / 3.3, 0.556)

@@ -124,7 +124,8 @@ class BinSampler:
         near_o = 1.0 / (1.0 + ((steps[None, :] - steps[:, None]) / 1.5) ** 2)
         self._o = near_o / near_o.sum(axis=1, keepdims=True)
         # Distance in bins from the azimuth of the mirror direction. In isotropic tables, whose azimuths are folded, the
-        # mirror direction is in the last bin. Anisotropic tables have bins on both sides of the mirror direction.
+        # mirror direction is in the last bin. In anisotropic tables, the distance is counted in both directions around
+        # the circle, and the smaller count is used.
         steps = np.arange(grid.phi_o)
         steps = np.minimum(steps, grid.phi_o - steps) if grid.phi_i else grid.phi_o - 1 - steps
         near_p = 1.0 / (1.0 + (steps / 1.5) ** 2)
