@@ -52,7 +52,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stretched_weights(tmp_path_factory):
-    """The weights file of a small adapter with bounded energy and with lobes stretched in the plane of incidence."""
+    """The weights file of a small, bounded adapter whose lobes are stretched along the plane of incidence."""
     path = tmp_path_factory.mktemp("weights") / "stretched.safetensors"
     replace(random_adapter(hidden="2x8", params=target.STRETCHED_PARAMS), bounded=True).save(path)
     return path

@@ -196,7 +196,7 @@ def test_curves_and_numbers_describe_the_same_brdf(kind):
 def test_an_anisotropic_adapter_has_no_curves():
     own = adapter("anisotropic")
     for call in (lambda: own.numbers(np.zeros((1, 0)), [0.5]), lambda: Curves(own, [])):
-        with pytest.raises(ParamError, match="no curves over cos.*call `prepare` with whole directions"):
+        with pytest.raises(ParamError, match="no curves over cos.*call `prepare` instead"):
             call()
 
 

@@ -204,7 +204,7 @@ def test_forward_and_backward_derivatives_agree(name, blended, tmp_path):
 def test_optimisation_finds_a_texture():
     """Optimisation recovers the albedo texture of a sheet under a uniform sky.
 
-    The 27 values of the texture are off by less than .02 on average and .08 at worst.
+    The 27 values of the recovered texture differ from the true values by less than .02 on average and .08 at worst.
     """
     wanted = np.random.default_rng(2).uniform(0.1, 0.9, (3, 3, 3))
     bsdf = MATERIAL | {"sigma_t": 1.0, "albedo": bitmap_texture(np.full((3, 3, 3), 0.5))}

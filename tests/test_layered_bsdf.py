@@ -272,7 +272,7 @@ def test_light_sampling_equals_bsdf_sampling(monkeypatch):
 def test_white_furnace():
     """A lossless material under a uniform sky is invisible (false-alarm rate .1 %).
 
-    A failure means that energy is lost.
+    A failure means that the simulation loses or adds light.
     """
     material = {**LACQUER, **WHITE, "alpha_top": 1e-4, "alpha_bottom": 1e-4, "sigma_t": 1.0}
     description = {

@@ -65,7 +65,7 @@ def test_no_lobe_exceeds_its_bound(params):
     """The albedo of all lobes of an instance stays below the sum of their bounds, in each channel.
 
     The bounds are tight: their mean is less than .08 above the mean albedo. A failure means that `bounded` may let a
-    blend gain energy, or that it dims blends too much.
+    blend reflect more light than it receives, or that `bounded` dims blends too much.
     """
     blend, mu = random_blends(params, 1, 1, 4.0)
     found, error = estimate(blend, mu)

@@ -117,7 +117,8 @@ def summary(steps: dict[str, Step], adapter: str, size: Size) -> dict:
 
 
 def plot(steps: dict[str, Step], adapter: str, size: Size, path: Path) -> None:
-    """Draws a column for each step: reference, adapter, and the FLIP between them. A table of metrics is below."""
+    """Draws a column for each step: reference, adapter, and the FLIP between them. Draws a table of metrics below the
+    pictures."""
     made = list(steps.values())
     differences = [difference_image(s.adapter, s.reference, kind="flip", scale=FLIP_SCALE) for s in made]
     rows = [

@@ -66,9 +66,9 @@ def evaluate(stack: Stack, wi: Vec3, wo: Vec3, rng: Random, active: Mask = True)
     backward, detour = _unscattered(stack, wo, back, wi, there, rng, False)
     scattered = _scattered(stack, there, [(Vec3(*back.direction), throughput(back)), detour], rng)
     # `backward` estimates f cos(theta_i), because its walks start from wo. Since f is reciprocal, `backward` times
-    # cos(theta_o) / cos(theta_i) is an estimate of f cos(theta_o). `scattered` estimates light inside the coat. When
-    # light leaves the coat, its radiance is divided by the squared index of refraction, so `scattered` is divided by
-    # the squared index here.
+    # cos(theta_o) / cos(theta_i) is an estimate of f cos(theta_o). `scattered` is the radiance of light inside the
+    # coat. When light leaves the coat, its radiance is divided by the squared index of refraction, so `scattered` is
+    # divided by the squared index here.
     index2 = stack.eta_top * stack.eta_top
     backward = backward * (wo.z / ops.maximum(wi.z, 1e-7)) + scattered * (wo.z / index2)
     return forward + backward + coat_reflection(stack, wi, wo)
