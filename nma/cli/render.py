@@ -76,8 +76,9 @@ def render(
 ) -> None:
     """Render a material in the preview scene, or a Mitsuba scene unchanged, and write an EXR and a PNG file.
 
-    A Mitsuba scene may contain the BSDFs `nma` and `layered`, which the program `mitsuba` cannot load. A Mitsuba scene
-    defines its own materials, camera, lights and path depth, so the options that set these are rejected for a scene.
+    A Mitsuba scene may contain the BSDFs `nma` and `layered`. (The program `mitsuba` can load these BSDFs only as
+    plugins that `nma mitsuba build` compiles.) A Mitsuba scene defines its own materials, camera, lights and path
+    depth, so the options that set these are rejected for a scene.
 
     Examples: [bold]nma render gold-red-lacquer --camera close --set alpha_top=.05[/bold],
     [bold]nma render my-material.toml --model layered -o out/my.exr[/bold], [bold]nma render scene.xml --spp 256[/bold]
