@@ -56,7 +56,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--variant", nargs="+", default=[frames.SCALAR, frames.VECTORISED])
     parser.add_argument("--scene", choices=scenes.SCENES, default="environment")
     parser.add_argument("--sigma", type=float, nargs="+", default=SIGMAS, help="extinctions")
-    return frames.parse(parser, size=32, spp=8, runs=2, sigma=(0.0, 1.0, 10.0))
+    return frames.parse(parser, size=32, spp=8, runs=2, sigma=(0.0, 10.0))
 
 
 def bsdfs(sigma: float) -> dict[str, dict[str, Any]]:

@@ -49,7 +49,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--reference-spp", type=int, default=8192, help="samples per pixel of the converged picture"
     )
-    return frames.parse(parser, size=32, spp=16, runs=2, reference_spp=256)
+    return frames.parse(parser, size=32, spp=4, runs=2, reference_spp=64)
 
 
 def describe(arguments: argparse.Namespace) -> dict[str, dict]:

@@ -93,7 +93,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--reference-spp", type=int, default=1024, help="samples per pixel of the converged pictures"
     )
-    return frames.parse(parser, size=32, spp=8, runs=2, materials=1, textured=1, reference_spp=64)
+    return frames.parse(
+        parser, size=32, spp=8, runs=2, materials=1, textured=1, reference_spp=64, scene=["preview"]
+    )
 
 
 def subjects(kind: str, arguments: argparse.Namespace) -> Iterator[scenes.Subject]:

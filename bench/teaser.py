@@ -63,7 +63,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--reference-spp", type=int, default=2048, help="samples per pixel of the converged picture"
     )
-    return frames.parse(parser, size=72, spp=8, runs=2, reference_spp=128)
+    return frames.parse(parser, size=36, spp=8, runs=2, reference_spp=64)
 
 
 def figures(own: frames.Frames, reference: frames.Converged) -> dict[str, float | None]:

@@ -98,6 +98,20 @@ def nma(monkeypatch, capsys):
     return run
 
 
+@pytest.fixture(scope="module")
+def fast_steps():
+    """Compiles training steps with few optimisations, because compiling takes longer than a short training run."""
+    import jax
+    from target_cases import FAST_COMPILE
+
+    from nma.train import loop
+
+    with pytest.MonkeyPatch.context() as patch:
+        steps = jax.jit(loop._group.__wrapped__, static_argnames=("recipe", "objective"), **FAST_COMPILE)
+        patch.setattr(loop, "_group", steps)
+        yield
+
+
 @pytest.fixture
 def material_file(tmp_path):
     """A function that replaces text in the material file PLAIN, writes the result to a file, and returns its path."""

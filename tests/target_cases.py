@@ -8,11 +8,7 @@ from nma.target import Blend, Principled
 # Arguments of `jax.jit` for tests that spend most of their time on compiling. The options turn off slow passes of XLA's
 # compiler, above all the fusion of the target's operations into large kernels.
 FAST_COMPILE = {
-    "compiler_options": {
-        "xla_disable_hlo_passes": "fusion,cpu-instruction-fusion",
-        "xla_cpu_use_fusion_emitters": True,
-        "xla_llvm_disable_expensive_passes": True,
-    }
+    "compiler_options": {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 }
 
 

@@ -55,7 +55,7 @@ def test_render_loads_our_bsdfs_in_a_scene_file(nma, untrained, tmp_path, bsdf):
 
 
 @pytest.mark.slow
-def test_a_bsdf_is_fitted_and_rendered(nma, tmp_path):
+def test_a_bsdf_is_fitted_and_rendered(nma, fast_steps, tmp_path):
     bsdf, fit = tmp_path / "matte.xml", tmp_path / "matte.safetensors"
     bsdf.write_text('<bsdf version="3.0.0" type="diffuse"/>')
     options = ("--network", "1x8", "--steps", "20", "--albedo", "0")

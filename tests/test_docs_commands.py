@@ -5,17 +5,14 @@ import shlex
 import shutil
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import typer
-from target_cases import FAST_COMPILE
 
 from nma import cli
 from nma.images.io import write_exr
 from nma.params import LAYERED3
 from nma.sources.merl import SHAPE, Merl
-from nma.train import loop
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "runtime/README.md"])
@@ -137,12 +134,10 @@ def measured_files(folder, origin):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", COMMANDS)
-def test_commands_of_the_pages_run(page, folder, nma, monkeypatch, request):
+def test_commands_of_the_pages_run(page, folder, nma, fast_steps, request):
     commands = COMMANDS[page]
     if any(word in MEASURED for words in commands for word in words):
         measured_files(folder, request.getfixturevalue("measurements"))
-    steps = jax.jit(loop._group.__wrapped__, static_argnames=("recipe", "objective"), **FAST_COMPILE)
-    monkeypatch.setattr(loop, "_group", steps)
     for words in commands:
         code, _, err = nma(*cheap(words))
         assert code == 0, (words, err)

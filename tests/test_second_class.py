@@ -164,7 +164,7 @@ def test_cpp_gets_the_parameters_of_the_class(bare):
 
 
 @pytest.mark.slow
-def test_a_class_is_sampled_trained_judged_and_prepared(bare, nma):
+def test_a_class_is_sampled_trained_judged_and_prepared(bare, nma, fast_steps):
     for words in (
         "dataset bare bare.zarr --materials 4 --walks 20000",
         "train bare --data bare.zarr -o bare.safetensors --steps 20 --network 1x8",

@@ -15,7 +15,6 @@ pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_t
 pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
 
 import jax
-from target_cases import FAST_COMPILE
 from training_cases import BRASS, TINY, batch_of, constant_adapter, lambertian, means_of
 
 from nma import network, target
@@ -28,16 +27,9 @@ from nma.train import run as training
 from nma.train.batches import BinSampler, Pool, draw
 from nma.train.recipe import CLASS, PAPER, SINGLE, Recipe, preset
 
+pytestmark = pytest.mark.usefixtures("fast_steps")
+
 QUICK = replace(SINGLE, network="1x16", rows=32, bins_per_row=8, points=32, steps=300, learning_rate=2e-2)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def fast_compile():
-    """Compiles the training steps with fewer optimisations, because compiling takes longer than a short run."""
-    with pytest.MonkeyPatch.context() as patch:
-        steps = jax.jit(loop._group.__wrapped__, static_argnames=("recipe", "objective"), **FAST_COMPILE)
-        patch.setattr(loop, "_group", steps)
-        yield
 
 
 @pytest.fixture(scope="module")

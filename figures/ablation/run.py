@@ -57,8 +57,9 @@ def main() -> None:
     arguments = parser.parse_args()
     folder = common.results(__file__, arguments.quick)
     names = arguments.only or list(CHANGES)[: 2 if arguments.quick else None]
-    steps = 100 if arguments.quick else arguments.steps
-    references = {name: common.reference(name, arguments.quick)[::3] for name in common.SETS}
+    steps = 50 if arguments.quick else arguments.steps
+    every = 4 if arguments.quick else 3
+    references = {name: common.reference(name, arguments.quick)[::every] for name in common.SETS}
     # The dataset is read only if a training needs it.
     tables = cache(lambda: data(arguments.data, arguments.quick))
     results = {}

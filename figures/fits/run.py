@@ -27,7 +27,7 @@ def main() -> None:
     arguments = parser.parse_args()
     names = arguments.materials or list(nma.material_names())[: 1 if arguments.quick else None]
     folder = common.results(__file__, arguments.quick)
-    walks, reference_walks = (4_000_000, 8_000_000) if arguments.quick else (64_000_000, 128_000_000)
+    walks, reference_walks = (2_000_000, 4_000_000) if arguments.quick else (64_000_000, 128_000_000)
     rows = [fit(name, walks, reference_walks, arguments.quick) for name in names]
     for row in rows:
         print(
@@ -44,7 +44,7 @@ def main() -> None:
 def fit(name: str, walks: int, reference_walks: int, quick: bool) -> dict:
     """Fits one material as `nma fit` does, and evaluates the fit on a reference from an independent random stream."""
     source, vector = nma.source("layered3"), nma.load_material(name).vector()
-    recipe = preset("single", steps=500 if quick else None)
+    recipe = preset("single", steps=100 if quick else None)
     began = time.perf_counter()
     tables = nma.tabulate(source, vector[None], walks, stream_keys(recipe.seed, [0]), error=False)
     adapter, _ = fit_material(source.space, recipe, vector, tables, {})
