@@ -1,7 +1,7 @@
 """Neural Material Adapter: a tiny network translates an expensive material into a blend of Principled BRDFs.
 
 The names below are the public interface. Each name is imported when it is first used, so `import nma` is fast.
-`import nma.render` registers the BSDFs `nma` and `layered` with Mitsuba. docs/python.md has examples.
+`import nma.render` registers the BSDFs `nma`, `layered` and `values` with Mitsuba. docs/python.md has examples.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Imports Dr.Jit with a libLLVM that is new enough. All modules of this package import `dr` from this module.
+"""Imports Dr.Jit with a libLLVM that is new enough. Modules that always need Dr.Jit import `dr` from here.
 
 Dr.Jit loads a libLLVM when it is first imported. A libLLVM that is too old kills the process when the first kernel is
 compiled, so this module chooses a new libLLVM before it imports Dr.Jit. If there is no usable libLLVM and no GPU for

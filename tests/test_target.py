@@ -119,7 +119,8 @@ def test_eval_equals_mitsuba_principled():
         plain = (allowance < 1e-5 * np.abs(value)) & ~opposite
         worst = max(worst, np.max((error / (np.abs(value) + 1e-9))[plain]))
         allowed += np.sum(~plain.all(axis=0))
-    # In at least 92 % of the cases the larger limits do not matter, and the values agree within single precision.
+    # At least 92 % of the pairs of directions are neither of the two cases in which the test allows larger differences.
+    # For these pairs, the values agree within single precision.
     assert allowed < 0.08 * 16 * n
     assert worst < 2e-5
 

@@ -80,7 +80,8 @@ def albedos(
         params: materials (n, 13).
         mu: cosines of the angles (ANGLES,).
         pairs: for each pair, the index material * ANGLES + angle.
-        shift: offset that is added to the sample points, modulo 1. Different offsets give independent estimates.
+        shift: offset that is added to the sample points, modulo 1. Estimates of two offsets differ by about
+            their error.
     """
     chunk = max(1, min(CHUNK, 2**28 // samples))
     parts = np.array_split(pairs, -(-len(pairs) // chunk))

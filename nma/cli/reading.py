@@ -190,7 +190,7 @@ def _holds_tables(path: Path) -> bool:
     try:
         with arrays(path) as f:
             return "weights" not in f
-    except Exception:  # the function that reads the file then reports the fault
+    except Exception:  # the file is read again later, where its fault is reported
         return True
 
 

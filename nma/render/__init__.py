@@ -32,8 +32,8 @@ def use(variant: str = "auto") -> str:
 
     Args:
         variant: one of `mi.variants()`, or "auto", which means cuda_ad_rgb on a machine with an NVIDIA GPU, and
-            otherwise llvm_ad_rgb. This package's BSDFs run in llvm_ad_rgb, cuda_ad_rgb and scalar_rgb. The plugins for
-            scalar_rgb are compiled when scalar_rgb is first chosen.
+            otherwise llvm_ad_rgb. This package's BSDFs run in llvm_ad_rgb and cuda_ad_rgb. `nma` and `layered` also run
+            in scalar_rgb, as plugins in C++ that are compiled when scalar_rgb is first chosen.
 
     Raises:
         ParamError: Mitsuba has no variant of this name.

@@ -36,7 +36,8 @@ class Settings(NamedTuple):
     """Settings of the demonstration.
 
     `size`: width and height of a picture. `spp`: samples per pixel of a measured frame. `runs`: measured frames per
-    BSDF. `reference_spp`: samples per pixel of the references. `adapter`: a weights file.
+    BSDF. `reference_spp`: samples per pixel of the references. `adapter`: the name of a shipped adapter, or a
+    weights file.
     """
 
     size: tuple[int, int] = (256, 256)

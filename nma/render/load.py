@@ -38,7 +38,8 @@ def material_bsdf(
         clamp: whether parameters outside the adapter's training range are clamped to that range instead of rejected.
 
     Raises:
-        ParamError: the model is unknown, or the material is of another class than the adapter or than "layered".
+        ParamError: the model is unknown, or cannot show the class of the material. "nma" shows the class of its
+            adapter, and "layered" shows `layered3`.
         WeightsError: there is no such adapter.
         TextureError: a texture cannot be read, or holds values that are not allowed.
     """

@@ -125,8 +125,7 @@ def _scratches(rng: np.random.Generator, size: int, count: int) -> Array:
 
 
 def _patches(rng: np.random.Generator, size: int) -> Array:
-    """Extinction (size, size): nearly opaque lacquer of uneven thickness, with islands where the lacquer is worn
-    off."""
+    """Extinction (size, size): lacquer of uneven thickness, with islands where the lacquer is worn off."""
     wear = periodic_noise(rng, size, period=0.30, slope=2.4)
     thickness = 0.85 + 0.10 * periodic_noise(rng, size, period=0.5, slope=3.0)
     return np.clip(thickness * _smoothstep(-0.75, -0.35, wear), 0.0, 1.0)

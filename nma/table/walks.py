@@ -22,7 +22,8 @@ _UNIT = 65536.0
 # The most walks per row in one kernel launch. A 32-bit counter has room for 65535 walks of throughput 1. The limit is
 # three quarters of 65535, because some throughputs may be above 1.
 _WALKS_PER_ROW = 49151
-# The most bins of all materials in one kernel launch, which limits the memory and does not change the result.
+# A kernel launch simulates as many materials as have this many bins together, but at least one material. The constant
+# limits the memory of a launch, and does not change the result.
 _BINS_PER_LAUNCH = 1 << 21
 
 

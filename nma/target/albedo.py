@@ -2,9 +2,9 @@
 proportion to its bound. `bounded` uses the bounds to keep a blend from reflecting more light than it receives.
 
 The Principled BRDF does not conserve energy. The diffuse lobe is not reduced where the specular lobe and the clearcoat
-reflect light. The retro-reflection of the diffuse lobe alone reaches 1.5 at grazing angles. For saturated colours,
-`spec_tint` may multiply a reflectance of .13 by 13. tests/test_target_albedo.py checks the bounds by quadrature over
-the ranges of the parameters.
+reflect light. The albedo of the diffuse lobe, with its retro-reflection, reaches 1.5 at grazing angles. For saturated
+colours, `spec_tint` may multiply a reflectance of .13 by 13. tests/test_target_albedo.py checks the bounds by
+quadrature over the ranges of the parameters.
 """
 
 from __future__ import annotations

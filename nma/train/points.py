@@ -88,7 +88,7 @@ class PointPool:
         return PointPool(*(x.astype(np.float32) for x in (mu, phi, wo, weight, value, albedo)))
 
     def draw(self, recipe: Recipe, step: int) -> PointBatch:
-        """The points of one step: random rows, and random points of each row."""
+        """The points of one step: random rows, and in each row consecutive points from a random start."""
         rng = np.random.default_rng((recipe.seed, step, 0x90))
         m = rng.integers(len(self.mu), size=recipe.rows)
         # The points of a row are consecutive, so that every _CROWDED-th point is near the mirror direction.

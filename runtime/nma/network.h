@@ -53,8 +53,8 @@ public:
             const bool last = k + 1 == layers.size();
             const int out = layers[k].out + (last ? 1 : 0);
             if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER)
-                throw Error("the network has a layer of more than " + std::to_string(WIDEST_LAYER) +
-                            " neurons, which this version cannot run");
+                throw Error("the network is too wide: this version runs at most " + std::to_string(WIDEST_LAYER) +
+                            " inputs, neurons in a hidden layer, and " + std::to_string(WIDEST_LAYER - 1) + " outputs");
             LayerView& view = view_.layers[k];
             view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
             view.bias = keep(layers[k].bias, view.width);
