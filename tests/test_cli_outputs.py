@@ -19,6 +19,15 @@ WRITING = [words for words, function in commands() if "output" in {name for name
 FUNCTIONS = dict(commands())
 
 
+def endings(words):
+    """Returns the endings of a command's output files, as the option declares them; for a folder, the empty ending."""
+    (info,) = (info for name, _, info in parameters(FUNCTIONS[words]) if name == "output")
+    return getattr(info.callback, "endings", ("",))
+
+
+FORMS = [(words, ending) for words in WRITING for ending in endings(words)]
+
+
 def arguments(words, output):
     """Returns the command-line words of a command that writes `output`.
 
@@ -66,10 +75,17 @@ def test_a_folder_is_no_output(nma, bad, output):
     assert [path.name for path in bad.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize("words", WRITING, ids="-".join)
+def test_the_tests_find_the_endings_of_all_outputs():
+    assert {(("principled",), ".xml"), (("data", "merl"), ".binary"), (("simulate",), ".npz")} <= set(FORMS)
+    assert [words for words, ending in FORMS if not ending] == [("dataset",)]
+
+
+@pytest.mark.parametrize(
+    ("words", "ending"), FORMS, ids=lambda part: part if isinstance(part, str) else "-".join(part)
+)
 @pytest.mark.parametrize("place", ["file/sub/x{}", "n" * 300 + "{}", "full/x{}"])
 def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
-    nma, bad, monkeypatch, words, place
+    nma, bad, monkeypatch, words, ending, place
 ):
     if place.startswith("full"):
 
@@ -77,9 +93,6 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_read(
             raise OSError(errno.ENOSPC, "No space left on device")
 
         monkeypatch.setattr(Path, "write_bytes", full)
-    endings = {"principled": ".xml", "merl": ".binary", "simulate": ".npz", "dataset": ""}
-    endings |= dict.fromkeys(("render", "compare", "demo"), ".png")
-    ending = endings.get(words[-1], ".safetensors")
     code, out, err = nma(*arguments(words, place.format(ending)))
     assert (code, out) == (1, ""), err
     assert err.startswith("nma: ") and err.count("\n") == 1

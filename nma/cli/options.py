@@ -61,12 +61,17 @@ def ending(path: Path, endings: Iterable[str]) -> str | None:
 
 
 def output(help: str, *endings: str, **more: Any) -> Any:
-    """The option --output: a file to write, whose name must end in one of `endings`."""
+    """The option --output: a file to write, whose name must end in one of `endings`.
+
+    The option's callback has an attribute `endings`, which tests read.
+    """
 
     def check(path: Path | None) -> Path | None:
         if path is not None and ending(path, endings) is None:
             raise typer.BadParameter(f"{path} must end in {either(endings)}")
         return path
+
+    check.endings = endings  # type: ignore[attr-defined]
 
     return typer.Option("--output", "-o", help=help, callback=check, **more)
 
