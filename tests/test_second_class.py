@@ -12,7 +12,7 @@ import nma.render
 from nma import sources
 from nma.adapter import Adapter
 from nma.errors import TableError
-from nma.export import FILES
+from nma.export import printed
 from nma.params import LAYERED3
 from nma.render.load import SceneError, load_dict
 from nma.table import ISOTROPIC, Tables
@@ -158,7 +158,7 @@ def test_training_refuses_data_of_another_class(bare):
 
 
 def test_cpp_gets_the_parameters_of_the_class(bare):
-    classes, constants = (FILES[f"nma/generated/{name}.h"]() for name in ("classes", "constants"))
+    classes, constants = (printed(f"nma/generated/{name}.h") for name in ("classes", "constants"))
     assert "bare_parameters()" in classes
     assert "namespace bare {" in constants and "constexpr int TINT = 1;" in constants
 

@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated
 
 import typer
 
 from nma import files
 from nma.cli import console, options, reading
-
-if TYPE_CHECKING:
-    from nma.target import Principled
+from nma.export import TEXTS, principled_text
 
 # If the mean error of the directional albedo exceeds ALBEDO_LIMIT, the error is visible in pictures, so the command
 # prints a warning.
 ALBEDO_LIMIT = 0.05
-
-
-class Text(NamedTuple):
-    """A text format: the renderer that reads the format, and the function that returns the content of a file."""
-
-    renderer: str
-    of: Callable[[Principled], str]
-
-
-def _xml(fitted: Principled) -> str:
-    from nma.export.mitsuba import principled_xml
-
-    return principled_xml(fitted)
-
-
-def _json(fitted: Principled) -> str:
-    from nma.export.mitsuba import principled_json
-
-    return principled_json(fitted)
-
-
-# The text formats, by the ending of a file's name. If two endings fit a name, the longer ending is used, so another
-# renderer whose files are JSON can have an ending such as `.blend.json`. The functions of the formats import their
-# modules only when they are called, so that `nma --help` is quick.
-_TEXTS = {".xml": Text("Mitsuba", _xml), ".json": Text("Mitsuba", _json)}
+_RENDERERS = ", ".join(f"{ending}: {text.renderer}" for ending, text in TEXTS.items())
 
 
 def register(app: typer.Typer) -> None:
@@ -66,8 +39,8 @@ def principled(
     output: Annotated[
         Path | None,
         options.output(
-            "A file to write too: a scene element for Mitsuba (.xml), .json, or weights (.safetensors).",
-            *_TEXTS,
+            f"A file to write too: weights (.safetensors), or the BRDF for a renderer ({_RENDERERS}).",
+            *TEXTS,
             ".safetensors",
         ),
     ] = None,
@@ -93,7 +66,7 @@ def principled(
         recipe = replace(recipe, steps=steps)
     with console.TrainingBar(recipe, "fitting") as bar:
         fit = fit_constant(tables, recipe, record, progress=bar.update)
-    print(_json(fit.principled), end="")
+    print(principled_text(".json", fit.principled), end="")
     error = fit.figures["albedo_error"]
     console.say(
         f"log loss {fit.log_loss:.5f} over the table, albedo error {error:.4f}",
@@ -102,13 +75,13 @@ def principled(
         console.say(_warning(error, fit.brightness))
     if output is None:
         return
-    kind = options.ending(output, _TEXTS)
+    kind = options.ending(output, TEXTS)
     if kind is None:
         fit.adapter.save(output)
         console.say(f"wrote {output}")
     else:
-        files.write_text(output, _TEXTS[kind].of(fit.principled))
-        console.say(f"wrote {output} for {_TEXTS[kind].renderer}")
+        files.write_text(output, principled_text(kind, fit.principled))
+        console.say(f"wrote {output} for {TEXTS[kind].renderer}")
 
 
 def _warning(error: float, brightness: float) -> str:
