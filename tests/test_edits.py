@@ -367,6 +367,10 @@ def test_attributes_are_the_inputs(adapter, kind):
     assert all(bsdf.has_attribute(name) for name in ("alpha_top", "sigma_t", "albedo"))
     assert not bsdf.has_attribute("reflectance")
     assert bsdf.eval_attribute_1("sigma_t", si)[0] == pytest.approx(0.3)
+    # For a colour, `eval_attribute_1` returns the mean of the channels, as Mitsuba's `principled` does.
+    mitsubas = mi.load_dict({"type": "principled", "base_color": rgb(0.9, 0.2, 0.1)})
+    for found, name in ((bsdf, "albedo"), (mitsubas, "base_color")):
+        assert found.eval_attribute_1(name, si)[0] == pytest.approx(0.4)
     alpha_top = np.array(mi.traverse(bsdf)["alpha_top"])[0]
     np.testing.assert_allclose(np.ravel(bsdf.eval_attribute("alpha_top", si)), [alpha_top] * 3)
     np.testing.assert_allclose(np.ravel(bsdf.eval_attribute_3("albedo", si)), [0.9, 0.2, 0.1], rtol=1e-6)

@@ -8,8 +8,10 @@ from PIL import Image
 
 import nma.render
 from nma import materials
-from nma.errors import MissingDependencyError, ParamError
+from nma.adapter import weights_file
+from nma.errors import MissingDependencyError, ParamError, WeightsError
 from nma.render.load import SceneError, load_dict, load_scene, material_bsdf
+from nma.render.mesh import needs_coordinates
 from nma.render.progressive import SAMPLES_PER_PASS, pass_sizes, render_passes
 from nma.render.scene import preview_scene
 
@@ -105,6 +107,25 @@ def test_a_material_becomes_a_dictionary_for_either_bsdf():
     assert reference["albedo"] == {"type": "rgb", "value": [0.95, 0.08, 0.03]}
     with pytest.raises(ParamError, match="unknown model"):
         material_bsdf(material, "principled")
+
+
+def test_adapters_are_found_in_the_folders_of_mitsubas_file_resolver(tmp_path, monkeypatch):
+    """`material_bsdf`, `needs_coordinates` and the BSDF `nma` find an adapter in the same folders."""
+    (tmp_path / "adapters").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "adapters" / "mine.safetensors").write_bytes(weights_file("layered3-3x32").read_bytes())
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    material, resolver = materials.load("gold-red-lacquer"), mi.file_resolver()
+    with pytest.raises(WeightsError, match="mine.safetensors: no such weights file"):
+        material_bsdf(material, adapter="mine.safetensors")
+    resolver.append(str(tmp_path / "adapters"))
+    try:
+        bsdf = material_bsdf(material, adapter="mine.safetensors")
+        assert bsdf["adapter"] == "mine.safetensors"
+        assert not needs_coordinates(bsdf)
+        assert "class = layered3" in str(load_dict(bsdf))
+    finally:
+        del resolver[len(resolver) - 1]
 
 
 @pytest.mark.parametrize("model", ["nma", "layered"])

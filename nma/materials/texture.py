@@ -126,7 +126,8 @@ def _bitmap(path: Path) -> Any:
 def is_coloured(rgb: NDArray[np.float32]) -> bool:
     """Whether any pixel is coloured, which means that its channels differ by more than rounding explains.
 
-    The limit is `ROUNDING`, or `ROUNDING` times the pixel's red value if the red value is above 1.
+    The difference of the largest and the smallest channel counts. The limit is `ROUNDING`, or `ROUNDING` times the
+    pixel's red value if the red value is above 1. The C++ version is `grey` in runtime/mitsuba/inputs.h.
     """
     with np.errstate(invalid="ignore"):
         spread = np.ptp(rgb, axis=-1)

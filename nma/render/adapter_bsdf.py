@@ -43,10 +43,7 @@ def define() -> type:
     class Nma(define_base()):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
             self.name = str(props.get("adapter", DEFAULT_ADAPTER))
-            # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
-            self.adapter = load_once(
-                self.name if self.name in shipped() else str(mi.file_resolver().resolve(self.name))
-            )
+            self.adapter = load_once(self.name)
             self.inputs = of_adapter(self.adapter, props)
             self._curves = self._make_curves()
             self._last = _LastBrdf()
@@ -147,9 +144,17 @@ def define() -> type:
     return Nma
 
 
-def load_once(name_or_path: str) -> Adapter:
+def load_once(name_or_path: str | Path) -> Adapter:
     """Loads an adapter by its name or from a weights file. BSDFs that name the same file share one `Adapter`, unless
-    the file changes."""
+    the file changes.
+
+    Paths are relative to the folders of Mitsuba's file resolver, such as the scene's folder, as for Mitsuba's own
+    plugins."""
+    import mitsuba as mi
+
+    name_or_path = str(name_or_path)
+    if name_or_path not in shipped() and mi.variant() is not None:
+        name_or_path = str(mi.file_resolver().resolve(name_or_path))
     path = weights_file(name_or_path)
     stat = Path(path).stat() if Path(path).is_file() else None
     return _loaded(name_or_path, (stat.st_mtime_ns, stat.st_size) if stat else None)

@@ -82,7 +82,9 @@ def define_base() -> type:
         def eval_attribute_1(self, name, si, active=True):
             if name not in self._attributes():
                 return super().eval_attribute_1(name, si, active)
-            return self.inputs.channels(name, si, active)[0]
+            # The mean of a colour's channels, as Mitsuba's own BSDFs return.
+            channels = self.inputs.channels(name, si, active)
+            return sum(channels) * (1.0 / len(channels)) if len(channels) > 1 else channels[0]
 
         def eval_attribute_3(self, name, si, active=True):
             if name not in self._attributes():

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nma.adapter import Adapter
 from nma.errors import NmaError, ParamError, either, one_line
 from nma.images.io import check_size
 from nma.materials import Material, Texture
 from nma.params import LAYERED3
-from nma.render.adapter_bsdf import DEFAULT_ADAPTER
+from nma.render.adapter_bsdf import DEFAULT_ADAPTER, load_once
 from nma.render.textures import bitmap_texture
 
 # The file extensions of the image formats that Mitsuba reads.
@@ -34,7 +33,8 @@ def material_bsdf(
     Args:
         material: returned by `nma.materials.load`. This function reads and checks the material's textures.
         model: "nma" (the adapter) or "layered" (the reference).
-        adapter: the name of a shipped adapter, or a weights file. Only the model "nma" uses this argument.
+        adapter: the name of a shipped adapter, or a weights file, which Mitsuba's file resolver finds. Only the model
+            "nma" uses this argument.
         clamp: whether parameters outside the adapter's training range are clamped to that range instead of rejected.
 
     Raises:
@@ -46,7 +46,7 @@ def material_bsdf(
     if model not in MODELS:
         raise ParamError(f"unknown model {model!r}; choose {either(MODELS)}")
     if model == "nma":
-        Adapter.load(adapter).check_class(material.class_name, material.name, str(adapter))
+        load_once(adapter).check_class(material.class_name, material.name, str(adapter))
     elif material.class_name != LAYERED3.name:
         raise ParamError(
             f"{material.name} is of class {material.class_name}, but the BSDF 'layered' simulates only class "

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.adapter import Adapter
 from nma.errors import NmaError, either, one_line
+from nma.render.adapter_bsdf import load_once
 
 KINDS = {".ply": "ply", ".obj": "obj"}
 AXES = ("z", "y")
@@ -56,7 +56,7 @@ def needs_coordinates(bsdf: Mapping[str, Any]) -> bool:
     """Whether a BSDF needs texture coordinates: its dictionary has a texture or an anisotropic adapter."""
     import mitsuba as mi
 
-    if bsdf.get("type") == "nma" and "adapter" in bsdf and Adapter.load(bsdf["adapter"]).anisotropic:
+    if bsdf.get("type") == "nma" and "adapter" in bsdf and load_once(bsdf["adapter"]).anisotropic:
         return True
     plain = ("rgb", "spectrum", "uniform")
     values = [value for value in bsdf.values() if isinstance(value, Mapping | mi.Texture)]

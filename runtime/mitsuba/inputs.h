@@ -240,13 +240,15 @@ private:
         Throw("the texture of %s%s: %s%s", p.name, place, refusal(p, found), hint);
     }
 
-    // Whether the channels of each pixel are equal up to rounding. The Python version is `is_coloured` in
+    // Whether the channels of each pixel are equal up to rounding: the largest minus the smallest channel is at most
+    // ROUNDING, or ROUNDING times the red value if the red value is above 1. The Python version is `is_coloured` in
     // nma/materials/texture.py, which returns the opposite.
     static bool grey(const Texels& texels) {
-        for (std::size_t k = 0; k < texels.numbers.size(); ++k) {
-            const float first = texels.numbers[k - k % texels.channels];
-            if (nma::absolute(texels.numbers[k] - first) > nma::ROUNDING * nma::maximum(nma::absolute(first), 1.0f))
-                return false;
+        const auto end = texels.numbers.end();
+        for (auto red = texels.numbers.begin(); red != end; red += static_cast<std::ptrdiff_t>(texels.channels)) {
+            const auto ends = std::minmax_element(red, red + static_cast<std::ptrdiff_t>(texels.channels));
+            const float spread = *ends.second - *ends.first;
+            if (spread > nma::ROUNDING * nma::maximum(nma::absolute(*red), 1.0f)) return false;
         }
         return true;
     }
