@@ -1,4 +1,4 @@
-"""The errors that this package raises. Each message says what is wrong, where, and what to do next."""
+"""Defines the errors that this package raises. Each message says what is wrong, where, and what to do next."""
 
 import difflib
 import re

@@ -1,5 +1,6 @@
-"""Kronecker lattices: evenly spread points of the unit cube, for quadrature. See Roberts 2018, "The Unreasonable
-Effectiveness of Quasirandom Sequences".
+"""Spreads points evenly over the unit cube, for quadrature.
+
+The points are Kronecker lattices. See Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""GGX microfacets and Fresnel reflectance, shared by the sources and by the target (CONVENTIONS.md).
+"""Evaluates GGX microfacets and Fresnel reflectance, for the sources and for the target (CONVENTIONS.md).
 
 Directions are unit vectors (`Vec3`) in the local frame, with z up, and point away from the surface. `alpha` is the
 microfacet width. Anisotropic functions have two widths as arguments, along x and along y. No function branches on

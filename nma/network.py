@@ -1,4 +1,4 @@
-"""The multilayer perceptron: linear layers with ReLU between them."""
+"""Evaluates the network of an adapter: linear layers with ReLU between them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Elementwise operations for Dr.Jit, JAX and NumPy, so that physics is written only once (CONVENTIONS.md).
+"""Calculates with Dr.Jit, JAX and NumPy arrays, so that physics is written only once (CONVENTIONS.md).
 
 Each function chooses the array package by the types of its arguments. For plain Python numbers, the result is a plain
 Python number. Code that uses this module must call `select` instead of branching on values. A `Vec3` is a triple of

@@ -1,4 +1,4 @@
-"""Progress bars on stderr, for commands and for Python calls that take minutes."""
+"""Shows progress bars on stderr, for commands and for Python calls that take minutes."""
 
 from __future__ import annotations
 

@@ -69,6 +69,19 @@ def test_a_step_of_the_data_is_refused_without_an_import(monkeypatch):
         drawing()
 
 
+def test_the_page_lists_the_steps_of_the_drawing():
+    page = (rooms.ROOT / "docs/how-it-is-built.md").read_text()
+    found = re.findall(r"^(\d+)\. \*\*`(\S+)` to `(\S+)`\.\*\*", page, re.MULTILINE)
+    assert found == [(str(n), step.start, step.end) for n, step in enumerate(WAY, start=1)]
+
+
+def test_the_docstring_of_each_room_says_what_the_room_does():
+    first = {room: rooms.summary(room).split()[0] for floor in rooms.floors() for room in floor}
+    assert not {room: word for room, word in first.items() if not re.fullmatch("[A-Z][a-z]+s,?", word)}, (
+        "begin the docstring of a room with a verb, as in 'Reads materials': tools.map draws the first sentence"
+    )
+
+
 def test_the_listing_describes_each_room():
     lines = listing().splitlines()
     assert [line.split()[1] for line in lines] == [room for floor in rooms.floors() for room in floor]

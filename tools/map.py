@@ -23,7 +23,7 @@ from tools.layout import Arrow, Layout, Place, layout
 
 OUT = Path(__file__).parents[1] / "docs/images/architecture.svg"
 # A box for the C++ runtime, which is outside the package: its name, its text, and a room whose floor it shares.
-OUTSIDE = ("runtime/", "The adapter in C++, for any renderer", "render")
+OUTSIDE = ("runtime/", "Evaluates and samples adapters in C++, for any renderer", "render")
 
 
 class Step(NamedTuple):
@@ -38,23 +38,25 @@ WAY = (
     Step("params", "sources", "the parameters of a class"),
     Step("sources", "table", "random walks through a material, or BRDF values"),
     Step("table", "train", "tables: binned values, with their noise"),
-    Step("train", "adapter", "a weights file, with everything that a renderer needs"),
+    Step("train", "adapter", "a trained network"),
     Step("adapter", "render", "the blend at a point, for Mitsuba"),
-    Step("adapter", OUTSIDE[0], "the same weights, for C++"),
+    Step("adapter", OUTSIDE[0], "a weights file, for C++"),
     Step("target", "export", "the analytic BRDF, as syntax trees"),
     Step("export", OUTSIDE[0], "the analytic BRDF, printed as C++"),
+    Step(OUTSIDE[0], "native", "the C++ code, compiled for Python and for Mitsuba's scalar_rgb"),
 )
 
-BOX, HEIGHT, GAP, RISE, PASSAGE, PORT = 210, 94, 14, 58, 16, 13  # px
+BOX, HEIGHT, GAP, RISE, PASSAGE, PORT = 230, 118, 14, 58, 16, 13  # px
 MARGIN, LABEL = 18, 20
-LETTERS, LINES = 26, 4  # the most letters per line, and the most lines, of the text in a box
+LETTERS, LINES = 24, 4  # the most letters per line, and the most lines, of the text in a box
+LEGEND = 28  # px from one line of the legend to the next
 STYLE = """\
 text { font-family: "Helvetica Neue", Helvetica, Arial, "DejaVu Sans", sans-serif; fill: #23303d }
-.name { font-family: Menlo, Consolas, "DejaVu Sans Mono", monospace; font-weight: bold; font-size: 16px }
-.what { font-size: 12.5px; fill: #52606d }
-.legend { font-size: 14px }
-.floor { font-size: 12px; fill: #9aa5b1 }
-.number { font-size: 12px; font-weight: bold; fill: #ffffff; text-anchor: middle }
+.name { font-family: Menlo, Consolas, "DejaVu Sans Mono", monospace; font-weight: bold; font-size: 19px }
+.what { font-size: 15.5px; fill: #3e4c59 }
+.legend { font-size: 18px }
+.floor { font-size: 15px; fill: #7b8794 }
+.number { font-size: 14px; font-weight: bold; fill: #ffffff; text-anchor: middle }
 .room { fill: #ffffff; stroke: #7b8794; stroke-width: 1.2 }
 .on-way { fill: #fff3e6; stroke: #d9782d; stroke-width: 1.6 }
 .outside { stroke-dasharray: 5 4 }
@@ -128,7 +130,7 @@ def _check(imports: frozenset[Arrow], level: Mapping[str, int]) -> None:
         sys.exit(f"{'; '.join(upwards)}: a room imports only from lower floors; see `make lint`")
     for step in WAY:
         ends = {(step.start, step.end), (step.end, step.start)}
-        if step.end != OUTSIDE[0] and not ends & imports:
+        if OUTSIDE[0] not in step[:2] and not ends & imports:
             sys.exit(f"neither of {step.start} and {step.end} imports the other; correct WAY in tools/map.py")
 
 
@@ -152,7 +154,7 @@ def _ports(placed: Layout, arrows: Sequence[Arrow]) -> dict[tuple[Arrow, str], f
 def drawing() -> str:
     """Returns the drawing as SVG text."""
     p = plan()
-    height = _top(len(p.floors)) + 22 * (len(WAY) + 2)
+    height = _top(len(p.floors)) + LEGEND * (len(WAY) + 2)
     size = f'width="{p.width}" height="{height}"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {p.width} {height}" {size}>',
@@ -194,16 +196,16 @@ def _box(p: Plan, box: str) -> str:
     kinds = ["room", *["outside"] * outside, *["on-way"] * any(box in arrow for arrow in p.steps)]
     what = OUTSIDE[1] if outside else rooms.summary(box, lambda text: len(_lines(text)) <= LINES)
     lines = [
-        f'<text class="what" x="{left + 12}" y="{top + 39 + 15 * n}">{escape(line)}</text>'
+        f'<text class="what" x="{left + 12}" y="{top + 47 + 19 * n}">{escape(line)}</text>'
         for n, line in enumerate(_lines(what))
     ]
     frame = f'<rect class="{" ".join(kinds)}" x="{left}" y="{top}" width="{BOX}" height="{HEIGHT}" rx="7"/>'
-    name = f'<text class="name" x="{left + 12}" y="{top + 21}">{escape(box)}</text>'
+    name = f'<text class="name" x="{left + 12}" y="{top + 25}">{escape(box)}</text>'
     return "\n".join([frame, name, *lines])
 
 
 def _lines(text: str) -> list[str]:
-    return textwrap.wrap(text, LETTERS)
+    return textwrap.wrap(text.replace("`", ""), LETTERS)
 
 
 def _arrow(p: Plan, kind: str, arrow: Arrow, upwards: bool = False) -> str:
@@ -239,26 +241,29 @@ def _middle(p: Plan, arrow: Arrow) -> tuple[int, int]:
 
 
 def _number(number: int, x: int, y: int) -> str:
-    circle = f'<circle class="step" cx="{x}" cy="{y}" r="9"/>'
-    return f'{circle}\n<text class="number" x="{x}" y="{y + 4}">{number}</text>'
+    circle = f'<circle class="step" cx="{x}" cy="{y}" r="11"/>'
+    return f'{circle}\n<text class="number" x="{x}" y="{y + 5}">{number}</text>'
 
 
 def _legend(p: Plan) -> list[str]:
     """Draws the legend: the meaning of the two kinds of arrows, and the list of the steps of the data."""
-    left, top = MARGIN + 12, _top(len(p.floors)) + 4
+    left, top = MARGIN + 16, _top(len(p.floors)) + 4
     told = (
         "The upper room imports the lower room. An import that also exists through other rooms is not drawn."
     )
     parts = [
-        f'<path class="import" d="M{left} {top - 4}h34"/>',
+        f'<path class="import" d="M{left} {top - 6}h34"/>',
         f'<text class="legend" x="{left + 46}" y="{top}">{told}</text>',
-        f'<path class="way" d="M{left} {top + 18}h30"/>',
-        f'<text class="legend" x="{left + 46}" y="{top + 22}">The path of the data:</text>',
+        f'<path class="way" d="M{left} {top + LEGEND - 6}h30"/>',
+        f'<text class="legend" x="{left + 46}" y="{top + LEGEND}">The path of the data:</text>',
     ]
     for n, step in enumerate(WAY, start=1):
-        y = top + 22 * (n + 1)
+        y = top + LEGEND * (n + 1)
         text = f"{step.start} to {step.end}: {step.what}"
-        parts += [_number(n, left + 15, y - 4), f'<text class="legend" x="{left + 46}" y="{y}">{text}</text>']
+        parts += [
+            _number(n, left + 15, y - 6),
+            f'<text class="legend" x="{left + 46}" y="{y}">{escape(text)}</text>',
+        ]
     return parts
 
 

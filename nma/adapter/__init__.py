@@ -1,4 +1,7 @@
-"""Adapters: a network with its encoding and its weights file. The folder `trained` contains the shipped adapters."""
+"""Joins a network, an encoding and a target to an adapter, and reads and writes weights files.
+
+The folder `trained` contains the shipped adapters.
+"""
 
 from nma.adapter.adapter import Adapter, shipped, weights_file
 

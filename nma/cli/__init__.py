@@ -1,4 +1,4 @@
-"""The command line `nma`: parses arguments, calls the other modules of the package, and prints results.
+"""Parses the arguments of the command `nma`, calls the other rooms, and prints their results.
 
 Each command is implemented in a file of the same name. Commands that share a first word, such as `nma library list` and
 `nma library encode`, share one file. To add a command, write a file with a function `register`, and add the file's name

@@ -1,4 +1,4 @@
-"""Real metals: their indices of refraction, from a table that is shipped with the package."""
+"""Reads the indices of refraction of real metals from a table that the package contains."""
 
 import csv
 from dataclasses import dataclass

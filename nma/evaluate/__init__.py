@@ -1,4 +1,4 @@
-"""Measures how good a model of a material is: errors of adapters against tables, and of sources against each other."""
+"""Measures the errors of adapters against tables, and of sources against each other."""
 
 from nma.evaluate.adapters import Evaluation, evaluate, table_log_loss, tabulate_adapter
 

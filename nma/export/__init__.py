@@ -1,4 +1,4 @@
-"""Prints the analytic BRDF as C++ headers, and a Principled BRDF as a file for a renderer that has such a BRDF.
+"""Prints the analytic BRDF as C++ headers, and a Principled BRDF for other renderers.
 
 To print the analytic BRDF in another language, add one file to this folder and one line to `FILES`. To write files for
 another renderer that has a Principled BRDF of its own, add one file to this folder and one line to `TEXTS`.

@@ -1,1 +1,1 @@
-"""Images: reading and writing image files, error metrics, and contact sheets."""
+"""Reads and writes image files, measures errors of images, and draws contact sheets."""

@@ -1,4 +1,4 @@
-"""Materials in TOML files (docs/materials.md): named materials that the package contains, and materials of users."""
+"""Reads the named materials of the package, and the material files of users (docs/materials.md)."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Compiles the C++ runtime (`build`) and calls it from Python (`runtime`)."""
+"""Compiles the C++ runtime on the user's machine (`build`), and calls the C++ runtime from Python (`runtime`)."""

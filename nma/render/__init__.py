@@ -1,4 +1,6 @@
-"""Rendering in Mitsuba 3. Importing this package registers its BSDF plugins `nma`, `layered` and `values`:
+"""Renders adapters, simulated materials and measurements in Mitsuba.
+
+Importing this package registers the BSDF plugins `nma`, `layered` and `values`:
 
     import mitsuba as mi
     import nma.render

@@ -1,4 +1,4 @@
-"""Sources of appearance: models that simulate materials, and files that store BRDF values of materials.
+"""Simulates materials by random walks, and reads BRDF values of materials from files.
 
 To simulate a new class of materials, add one file to this folder, with the class's parameters and its source, and one
 line to `CLASSES`. To read a new format of files that store BRDF values, add one file to this folder and one line to

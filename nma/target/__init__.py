@@ -1,4 +1,7 @@
-"""The analytic BRDF whose parameters the networks output: a blend of Principled BRDFs, for Dr.Jit, JAX and NumPy."""
+"""Decodes, evaluates and samples the analytic BRDF whose parameters the networks output.
+
+The analytic BRDF is a blend of Principled BRDFs, on Dr.Jit, JAX or NumPy arrays.
+"""
 
 from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, sample
 from nma.target.brdf import Brdf

@@ -1,4 +1,7 @@
-"""Training of adapters with JAX, an optional extra: in a checkout, `pip install '.[train]'`."""
+"""Trains adapters: fits their networks to tables or to BRDF values, with JAX.
+
+JAX is an optional extra: in a checkout, `pip install '.[train]'`.
+"""
 
 from nma.errors import MissingDependencyError
 
