@@ -3,6 +3,7 @@
 The committed drawing shows all rooms and imports.
 """
 
+import ast
 import re
 import sys
 
@@ -153,26 +154,202 @@ def test_the_layout_is_the_same_each_time(ladder):
     assert layout(*ladder, box=10.0, passage=2.0) == layout(*ladder, box=10.0, passage=2.0)
 
 
-# lint-imports does not see imports by name. These files import modules of this package by name:
+# lint-imports sees import statements only. These modules of Python can import a module in other ways:
+IMPORTERS = {"_frozen_importlib", "builtins", "imp", "importlib", "pkgutil", "runpy", "zipimport"}
+# So can these names, which need no import, and these attributes:
+BUILT_IN = {"__builtins__", "__import__", "__loader__", "__spec__", "compile", "eval", "exec"}
+ATTRIBUTES = {"__import__", "import_module", "modules"}
+# The files that use such modules, names or attributes, the reason, and every use.
 BY_NAME = {
-    "nma/__init__.py",
-    *("nma/cli/__init__.py", "nma/export/__init__.py", "nma/render/register.py", "nma/sources/__init__.py"),
+    "nma/__init__.py": (
+        "each public name is imported when it is first used",
+        ["from importlib import import_module", "import_module(home)"],
+    ),
+    "nma/cli/__init__.py": (
+        "each command is a module of the room, and only the module of the given command is imported",
+        ["from importlib import import_module", "import_module(f'nma.cli.{name}')"],
+    ),
+    "nma/export/__init__.py": (
+        "each printer is a module of the room, and is imported when first used",
+        ["from importlib import import_module", "import_module(f'nma.export.{module}')"],
+    ),
+    "nma/render/register.py": (
+        "each BSDF is a module of the room, and is imported when Mitsuba registers the BSDF",
+        ["import importlib", "importlib.import_module(module)"],
+    ),
+    "nma/sources/__init__.py": (
+        "each source is a module of the room, and is imported when the source is first used",
+        ["from importlib import import_module", "import_module(f'nma.sources.{module}')"],
+    ),
+    "nma/sources/lookup.py": (
+        "Dr.Jit has a module for each backend",
+        ["from importlib import import_module", "import_module(type(lanes).__module__)"],
+    ),
+    "nma/doctor.py": (
+        "packages of others that may be missing, and their versions",
+        [
+            "from importlib import metadata",
+            "import importlib",
+            "importlib.import_module(name)",
+            "metadata.PackageNotFoundError",
+            "metadata.requires(PACKAGE)",
+            "metadata.version(distribution)",
+        ],
+    ),
+    "nma/images/metrics.py": (
+        "packages of others that may be missing",
+        ["from importlib import import_module", "import_module(name)"],
+    ),
+    "nma/llvm.py": ("whether Dr.Jit is loaded already", ["'drjit' in sys.modules"]),
+    "nma/network.py": (
+        "NumPy knows the features of the CPU, in a module that has two names",
+        ["sys.modules.get('numpy._core._multiarray_umath')", "sys.modules['numpy.core._multiarray_umath']"],
+    ),
+    "nma/adapter/adapter.py": (
+        "files of the package",
+        ["files('nma.adapter')", "from importlib.resources import files"],
+    ),
+    "nma/conductors/__init__.py": (
+        "files of the package",
+        ["files(__name__)", "from importlib.resources import files"],
+    ),
+    "nma/native/build.py": (
+        "folders and versions of packages",
+        [
+            "import importlib.metadata",
+            "importlib.metadata.PackageNotFoundError",
+            "importlib.metadata.distribution(name)",
+            "importlib.metadata.version(name)",
+        ],
+    ),
+    "nma/train/run.py": (
+        "the version of the package",
+        ["import importlib.metadata", "importlib.metadata.version('neural-material-adapter')"],
+    ),
 }
-# These files import other packages by name:
-OTHERS_BY_NAME = {"nma/doctor.py", "nma/images/metrics.py", "nma/sources/lookup.py"}
 
 
-def test_only_known_files_import_by_name():
-    found = {
-        str(path.relative_to(rooms.ROOT))
-        for path in (rooms.ROOT / rooms.PACKAGE).rglob("*.py")
-        if re.search(r"\b(import_module|__import__)\(", path.read_text())
-    }
-    assert found == BY_NAME | OTHERS_BY_NAME
+def imported(tree):
+    """Yields each import of a syntax tree: the statement, the imported module or object, and its name in the file."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node, alias.name, alias.asname or alias.name.split(".")[0]
+        elif isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                yield node, f"{node.module}.{alias.name}", alias.asname or alias.name
 
 
-@pytest.mark.parametrize("path", sorted(BY_NAME - {"nma/__init__.py"}))
+def unseen_imports(text):
+    """Lists all code in the Python file `text` that can import a module without an import statement.
+
+    The listed code is an import from `IMPORTERS` or of `sys.modules`, or the smallest call, subscript or comparison
+    around the use of such an import, of a name in `BUILT_IN`, or of an attribute in `ATTRIBUTES`.
+    """
+    tree, names, found = ast.parse(text), set(BUILT_IN), []
+    above = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
+    for statement, origin, name in imported(tree):
+        if origin.split(".")[0] in IMPORTERS or origin in ("sys.modules", "sys.*"):
+            names.add(name)
+            found.append(statement)
+    for node in ast.walk(tree):
+        attribute = getattr(
+            node, "attr", getattr(node, "value", None)
+        )  # the text of `getattr` is an `ast.Constant`
+        if getattr(node, "id", None) in names or (isinstance(attribute, str) and attribute in ATTRIBUTES):
+            while isinstance(above[node], ast.Attribute):
+                node = above[node]
+            around = above[node]
+            found.append(around if isinstance(around, (ast.Call, ast.Subscript, ast.Compare)) else node)
+    return sorted({ast.unparse(node) for node in found})
+
+
+def files_of_the_package():
+    paths = (rooms.ROOT / rooms.PACKAGE).rglob("*.py")
+    return {path.relative_to(rooms.ROOT).as_posix(): path.read_text() for path in paths}
+
+
+def test_only_listed_code_imports_without_an_import_statement():
+    found = {path: uses for path, text in files_of_the_package().items() if (uses := unseen_imports(text))}
+    listed = {path: sorted(uses) for path, (_, uses) in BY_NAME.items()}
+    assert found == listed, (
+        "use an import statement, which lint-imports sees, or add the use and its reason to BY_NAME"
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from importlib import import_module as get",
+        "import importlib as lib",
+        "import importlib.metadata\ngetattr(importlib, 'import_' + 'module')('nma.train')",
+        "from importlib.metadata import EntryPoint",
+        "from pkgutil import resolve_name",
+        "import runpy",
+        "exec('import nma.train')",
+        "eval(text)",
+        "__builtins__['__import__']('nma.cli')",
+        "__spec__.loader",
+        "sys.modules['nma.cli']",
+        "getattr(sys, 'modules')",
+        "from sys import modules as loaded",
+        "from sys import *",
+    ],
+)
+def test_other_ways_to_import_are_seen(text):
+    assert unseen_imports(text)
+
+
+@pytest.mark.parametrize(
+    "call", ["import_module ('nma.cli')", "import_module('nma.' + 'train')", "f(import_module)"]
+)
+def test_a_listed_file_imports_nothing_else_by_name(call):
+    about = "from importlib import import_module\n"
+    assert unseen_imports(about + call) != unseen_imports(about + "import_module(name)")
+
+
+@pytest.mark.parametrize("path", [path for path in BY_NAME if "a module of the room" in BY_NAME[path][0]])
 def test_modules_are_imported_by_name_within_their_room(path):
     """`nma/__init__.py` lies on no floor of the drawing, so it may import any room."""
-    named = re.findall(r'"(nma\.\w+)', (rooms.ROOT / path).read_text())
-    assert set(named) == {".".join(path.split("/")[:2])}
+    tree, room = ast.parse((rooms.ROOT / path).read_text()), ".".join(path.split("/")[:2])
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    named = {text for text in texts if isinstance(text, str) and re.match(r"nma\.\w*$|nma\.\w+\.", text)}
+    assert named and all(text.startswith(f"{room}.") for text in named)
+
+
+def public_names(text):
+    """Lists the names of the package in the Python file `text` that are no imported rooms.
+
+    `nma/__init__.py` imports its public names from any room, when they are first used. lint-imports does not see which.
+    """
+    tree = ast.parse(text)
+    floors = {f"nma.{room}" for floor in rooms.floors() for room in floor}
+    origins = {origin for _, origin, _ in imported(tree)}
+    aliases = {name for _, origin, name in imported(tree) if origin == "nma"} | {"nma"}
+    uses = {
+        f"nma.{node.attr}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases
+    }
+    names = {name for name in origins | uses if name.startswith("nma.")}
+    imported_rooms = {".".join(name.split(".")[:2]) for name in origins} & floors
+    return {name for name in names if ".".join(name.split(".")[:2]) not in imported_rooms}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("from nma import preview_scene, ops", {"nma.preview_scene"}),
+        ("from nma import *", {"nma.*"}),
+        ("import nma as n\nn.fit", {"nma.fit"}),
+        ("import nma.ops\nnma.ops.exp(nma.fit)", {"nma.fit"}),
+    ],
+)
+def test_uses_of_public_names_are_seen(text, found):
+    assert public_names(text) == found
+
+
+def test_rooms_do_not_use_the_public_names():
+    """The room `cli` may use the version, because it lies on the highest floor."""
+    found = {path: used for path, text in files_of_the_package().items() if (used := public_names(text))}
+    assert found == {"nma/cli/__init__.py": {"nma.__version__"}}
