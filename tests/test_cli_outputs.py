@@ -65,14 +65,53 @@ def test_the_tests_find_all_commands_that_write():
     assert {("library", "encode"), ("library", "extract"), ("train-library",)} <= set(WRITING)
 
 
+@pytest.mark.parametrize("words", WRITING, ids="-".join)
 @pytest.mark.parametrize("output", [".", "..", "/", ""])
-def test_a_folder_is_no_output(nma, bad, output):
-    for words in WRITING:
-        if words != ("dataset",):  # the output of `nma dataset` is a folder
-            code, out, err = nma(*arguments(words, output))
-            assert code in (1, 2) and out == "", words
-            assert "cannot be written" in err or "must end in" in err, words
+def test_a_folder_is_no_output(nma, bad, monkeypatch, words, output):
+    """A folder with other files is refused as an output, also for `nma dataset`, whose output is a folder."""
+
+    def write(*args, **kwargs):
+        raise AssertionError("nothing may be written")
+
+    monkeypatch.setattr(Path, "write_bytes", write)
+    monkeypatch.setattr("zarr.create_array", write)
+    code, out, err = nma(*arguments(words, output))
+    assert code in (1, 2) and out == "", err
+    if output:
+        assert "cannot be written" in err or "must end in" in err
+    else:
+        assert "the path is empty" in err
     assert [path.name for path in bad.iterdir()] == ["file"]
+
+
+def test_no_command_reads_an_empty_path_as_the_current_folder(nma, bad):
+    for words in (
+        ("data", "check", ""),
+        ("train-library", "", "-o", "x.safetensors"),
+        ("train", "layered3", "--data", "", "-o", "x.safetensors"),
+        ("library", "list", ""),
+    ):
+        code, out, err = nma(*words)
+        assert (code, out) == (2, "") and "the path is empty" in err, words
+
+
+def test_only_a_dataset_or_an_empty_folder_becomes_a_dataset(nma, bad):
+    small = ("--materials", 1, "--walks", 1600)
+    Path("empty").mkdir()
+    Path("own").mkdir()
+    Path("own/notes.txt").write_text("mine")
+    for _ in range(2):
+        assert nma("dataset", "layered3", "empty", *small)[0] == 0
+    code, out, err = nma("dataset", "layered3", "own", *small)
+    assert (code, out, err) == (
+        1,
+        "",
+        "nma: own: cannot be written (a folder with other files); choose a dataset, or a new or an empty folder\n",
+    )
+    code, _, err = nma("train", "layered3", "--data", "own", "-o", "x.safetensors")
+    assert code == 1 and err.count("\n") == 1
+    assert "CLASS own" not in err and "`nma dataset CLASS FOLDER` makes one in a new folder" in err
+    assert [path.name for path in Path("own").iterdir()] == ["notes.txt"]
 
 
 def test_the_tests_find_the_endings_of_all_outputs():

@@ -40,7 +40,9 @@ def listing(context: typer.Context) -> None:
 
 
 @data.command()
-def check(path: Annotated[Path, typer.Argument(help="A file, or a folder with files.")]) -> None:
+def check(
+    path: Annotated[Path, typer.Argument(help="A file, or a folder with files.", parser=options.path)],
+) -> None:
     """Check files of measurements: the size, the structure, the values and, where it is known, the checksum.
 
     The exit status is 1 if any file has a fault.

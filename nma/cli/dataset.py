@@ -17,7 +17,10 @@ def register(app: typer.Typer) -> None:
 
 def dataset(
     class_name: Annotated[str, typer.Argument(help="The class to sample, layered3.")],
-    output: Annotated[Path, typer.Argument(help="The dataset (.zarr folder) to create or complete.")],
+    output: Annotated[
+        Path,
+        typer.Argument(help="The dataset (.zarr folder) to create or complete.", parser=options.path),
+    ],
     materials: Annotated[int, options.number("Number of materials.", 1, 10**6)] = 8000,
     walks: Annotated[int, options.walks("Random walks per material.")] = 819_200,
     seed: Annotated[int, options.seed("Equal seeds give equal datasets.")] = 0,
@@ -29,8 +32,9 @@ def dataset(
 
     The same command continues a killed run. Several runs may write to one dataset at the same time.
     """
-    from nma.table.dataset import Dataset, Settings
+    from nma.table.dataset import Dataset, Settings, check_folder
 
+    check_folder(output)
     files.try_folder(output)
     data = Dataset.create(output, Settings(class_name, materials, walks, seed, population))  # type: ignore[arg-type]
     before = materials - len(data.missing())

@@ -18,7 +18,10 @@ def register(app: typer.Typer) -> None:
 
 def evaluate(
     weights: Annotated[str, typer.Argument(help="A weights file or the name of a shipped adapter.")],
-    reference: Annotated[Path, typer.Option(help="A reference file made by `nma simulate`.")],
+    reference: Annotated[
+        Path,
+        typer.Option(help="A reference file made by `nma simulate`.", parser=options.path),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print nothing but JSON on stdout.")] = False,
     clamp: options.Clamp = False,
 ) -> None:

@@ -18,7 +18,10 @@ library = typer.Typer(
     help="List the materials of a library, add one, or write one as an adapter of its own.",
 )
 
-_Library = Annotated[Path, typer.Argument(metavar="LIBRARY", help="A library that `nma train-library` made.")]
+_Library = Annotated[
+    Path,
+    typer.Argument(metavar="LIBRARY", help="A library that `nma train-library` made.", parser=options.path),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -32,6 +35,7 @@ def train_library(
         typer.Argument(
             metavar="DIR",
             help="A folder with files of values, or a single such file, for example NBRDF weights (.npz).",
+            parser=options.path,
         ),
     ],
     output: options.Weights,
@@ -89,7 +93,10 @@ def listing(path: _Library) -> None:
 @library.command()
 def encode(
     path: _Library,
-    source: Annotated[Path, typer.Argument(help="A file with the values of the new material.")],
+    source: Annotated[
+        Path,
+        typer.Argument(help="A file with the values of the new material.", parser=options.path),
+    ],
     output: Annotated[Path, options.output("The library to write, with one more material.", ".safetensors")],
     material: Annotated[
         str | None, typer.Option(help="Which material, if the file contains several.")

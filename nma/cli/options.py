@@ -60,6 +60,13 @@ def ending(path: Path, endings: Iterable[str]) -> str | None:
     return max(fitting, key=len, default=None)
 
 
+def path(text: str | Path) -> Path:
+    """Parses a path. Rejects an empty path, which Python would read as the current folder."""
+    if str(text) == "":
+        raise typer.BadParameter("the path is empty; name a file or a folder")
+    return Path(text)
+
+
 def output(help: str, *endings: str, **more: Any) -> Any:
     """The option --output: a file to write, whose name must end in one of `endings`.
 
@@ -73,7 +80,7 @@ def output(help: str, *endings: str, **more: Any) -> Any:
 
     check.endings = endings  # type: ignore[attr-defined]
 
-    return typer.Option("--output", "-o", help=help, callback=check, **more)
+    return typer.Option("--output", "-o", help=help, callback=check, parser=path, **more)
 
 
 def _network(name: str | None) -> str | None:
@@ -160,7 +167,10 @@ Lighting = Annotated[
 ]
 Envmap = Annotated[
     Path | None,
-    typer.Option(help="Light the scene by this environment map (EXR or HDR), instead of --lighting."),
+    typer.Option(
+        help="Light the scene by this environment map (EXR or HDR), instead of --lighting.",
+        parser=path,
+    ),
 ]
 Size = Annotated[str, typer.Option(help="Pixels: 512 for a square, or 512x384.")]
 Depth = Annotated[int, number("Longest light path, in edges.", 1, 1000)]

@@ -40,7 +40,8 @@ def render(
     mesh: Annotated[
         Path | None,
         typer.Option(
-            help="Show this mesh (PLY or OBJ) in place of the ball, scaled to its size and put on the floor."
+            help="Show this mesh (PLY or OBJ) in place of the ball, scaled to its size and put on the floor.",
+            parser=options.path,
         ),
     ] = None,
     mesh_up: Annotated[str, typer.Option(help="The axis of the mesh that points up: z or y.")] = "z",

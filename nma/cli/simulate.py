@@ -29,7 +29,8 @@ def simulate(
     params: Annotated[
         Path | None,
         typer.Option(
-            help="A file (.npz) with an array `params` (n, columns of the class), as reference files have."
+            help="A file (.npz) with an array `params` (n, columns of the class), as reference files have.",
+            parser=options.path,
         ),
     ] = None,
     material: Annotated[
@@ -46,6 +47,8 @@ def simulate(
     seed: Annotated[int, options.seed("Seed of the walks and of the drawn materials.")] = 0,
 ) -> None:
     """Simulate materials, and write their tables and standard errors to a reference file.
+
+    The same command continues a killed run from the tables in OUTPUT.parts.
 
     Example: [bold]nma simulate --material gold-red-lacquer --walks 128000000 -o gold.npz[/bold]
     """

@@ -19,7 +19,10 @@ def register(app: typer.Typer) -> None:
 def train(
     class_name: Annotated[str, typer.Argument(help="The class to learn, layered3.")],
     output: options.Weights,
-    data: Annotated[Path | None, typer.Option(help="A dataset made by `nma dataset`.")] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="A dataset made by `nma dataset`.", parser=options.path),
+    ] = None,
     stream: Annotated[
         int,
         options.number(

@@ -105,9 +105,10 @@ class Dataset:
     def create(path: str | Path, settings: Settings) -> Dataset:
         """Opens the dataset at `path`, or creates a dataset there if `path` has none.
 
-        Raises `DatasetError` if the dataset was made with other settings.
+        Raises `DatasetError` if the dataset was made with other settings, or if `path` is a folder with other files.
         """
         path = Path(path)
+        check_folder(path)
         if not os.path.exists(path / "zarr.json"):
             _create_array(path, settings)
         found = Dataset.open(path)
@@ -134,6 +135,10 @@ class Dataset:
             advice = f"`nma dataset CLASS {path}` makes one"
             if os.path.exists(path / "zarr.json"):
                 advice = f"choose another folder; a damaged dataset can be deleted and made again: {advice}"
+            elif _has_other_files(path) or os.path.isfile(path):
+                advice = (
+                    "choose the folder of a dataset; `nma dataset CLASS FOLDER` makes one in a new folder"
+                )
             reason = str(e).partition("\n")[0] or type(e).__name__
             raise DatasetError(f"{path} is not a dataset of tables ({reason}); {advice}") from None
         if settings.format != FORMAT:
@@ -213,6 +218,22 @@ class Dataset:
                 ) from None
         walks = np.full(len(indices), ISOTROPIC.walks(self.settings.walks), np.int64)
         return Tables(draw_params(self.settings, indices), values, walks, None, self.settings.class_name)
+
+
+def check_folder(path: Path) -> None:
+    """Raises `DatasetError` if `path` is a folder that has files but no dataset, because a dataset would be mixed with
+    these files."""
+    if _has_other_files(path):
+        raise DatasetError(
+            f"{path}: cannot be written (a folder with other files); choose a dataset, or a new or an empty folder"
+        )
+
+
+def _has_other_files(path: Path) -> bool:
+    """Whether `path` is a folder that has files but no dataset. Temporary files do not count, because another worker
+    may be creating a dataset."""
+    names = os.listdir(path) if os.path.isdir(path) else []
+    return "zarr.json" not in names and not all(name.endswith(".partial") for name in names)
 
 
 def _create_array(path: Path, settings: Settings) -> None:
