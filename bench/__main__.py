@@ -14,6 +14,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from nma.files import into_pipe
+
 HERE = Path(__file__).parent
 # Benches that write no files, each with its options for a quick run.
 PRINTING = {"training": ["--steps", "60"], "walks": ["--walks", "81920", "--repeat", "1"]}
@@ -62,4 +64,5 @@ def words(name: str, quick: bool, output: Path | None) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    with into_pipe():
+        main()

@@ -13,6 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from nma.files import into_pipe
+
 HERE = Path(__file__).parent
 
 
@@ -39,4 +41,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with into_pipe():
+        main()

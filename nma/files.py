@@ -6,6 +6,7 @@ import errno
 import os
 import secrets
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -121,6 +122,30 @@ def try_folder(path: str | Path) -> None:
         _try_folder(path)
     except OSError as error:
         raise _refused(path, error) from error
+
+
+def close_stdout() -> None:
+    """Redirects stdout to the null device if writing to stdout fails.
+
+    Writing fails if the reader of a pipe has ended or the disk is full. Without the redirection, Python would print
+    another error when it flushes stdout at its exit.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def into_pipe() -> Iterator[None]:
+    """A context manager for programs that print: ends the program without a traceback if the reader of a pipe, such as
+    `head`, has ended."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        close_stdout()
+        sys.exit(1)
 
 
 def _try_folder(folder: Path, *names: str) -> None:

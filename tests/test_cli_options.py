@@ -9,7 +9,7 @@ import pytest
 from cli_cases import commands, numbers
 
 import nma as package
-from nma import materials
+from nma import cli, materials, sources
 from nma.cli import options
 from nma.params import Population
 from nma.target import TARGETS
@@ -144,15 +144,31 @@ cli.main()
     process.terminate()
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err.count("\n")) == (143, 1)
-    assert "run the same command again" in err
+    assert "unfinished results were not written; run the command again" in err
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_command_says_how_to_continue(nma, monkeypatch):
-    def interrupted():
+def test_an_interrupted_command_says_whether_the_next_run_continues(nma, tmp_path, monkeypatch):
+    def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(materials, "names", interrupted)
-    code, out, err = nma("materials")
-    assert (code, out) == (130, "")
-    assert err == "nma: interrupted; run the same command again to continue from its stored results\n"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(materials, "load", interrupted)
+    monkeypatch.setattr(sources, "get", interrupted)
+    stored = "nma: interrupted; run the same command again to continue from its stored results\n"
+    lost = "nma: interrupted; unfinished results were not written; run the command again\n"
+    for words, message in (
+        (("simulate", "--draw", 1, "-o", "x.npz"), stored),
+        (("dataset", "layered3", "x.zarr"), stored),
+        (("train", "layered3", "--stream", 1, "-o", "x.safetensors"), stored),
+        (("materials",), lost),
+        (("render", "gold-red-lacquer"), lost),
+        (("fit", "gold-red-lacquer", "-o", "x.safetensors"), lost),
+        (("data", "merl", "gold-red-lacquer", "-o", "x.binary"), lost),
+    ):
+        assert nma(*words) == (130, "", message), words
+
+
+def test_the_help_of_every_resuming_command_says_that_the_command_resumes():
+    told = {words[-1] for words, function in commands() if "continues a killed run" in function.__doc__}
+    assert told == set(cli.RESUMING)

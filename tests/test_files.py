@@ -3,6 +3,8 @@
 import errno
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from nma.sources.merl import SHAPE, Merl
 from nma.table import Tables
 from nma.train.plot import plot_losses
 
+ROOT = Path(__file__).parents[1]
 IMAGE = np.full((4, 4, 3), 0.5, np.float32)
 
 
@@ -105,6 +108,17 @@ def test_if_two_writers_make_a_folder_the_first_wins(tmp_path):
             (early / "file").write_text("early")
     assert contents(tmp_path) == ["made", "made/file"]
     assert (tmp_path / "made" / "file").read_text() == "early"
+
+
+@pytest.mark.parametrize("program", ["bench", "figures"])
+def test_a_list_ends_silently_if_the_reader_of_the_pipe_has_ended(program):
+    """`python -m bench | head -5` prints no traceback."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", program]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 def _full(*args, **kwargs):

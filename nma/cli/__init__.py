@@ -7,7 +7,6 @@ to `COMMANDS`.
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from importlib import import_module
@@ -18,16 +17,21 @@ from typer.core import TyperGroup
 
 import nma
 from nma.errors import NmaError, one_line
+from nma.files import close_stdout
 
 
 class _Commands(TyperGroup):
     """The group of all commands, which prints a message on Ctrl-C; typer alone prints none."""
 
     def invoke(self, ctx: Any) -> Any:
+        # Without a handler, SIGTERM would end the process at once, and leave incomplete files.
+        signal.signal(
+            signal.SIGTERM, lambda number, frame: _interrupted(ctx.invoked_subcommand, 128 + number)
+        )
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            _interrupted()
+            _interrupted(ctx.invoked_subcommand)
 
 
 app = typer.Typer(
@@ -64,6 +68,8 @@ COMMANDS = (
     "info",
     "doctor",
 )
+# The commands that store results while they run, and continue from these results when they are run again.
+RESUMING = ("simulate", "dataset", "train", "train-library")
 for name in COMMANDS:
     import_module(f"nma.cli.{name}").register(app)
 
@@ -85,8 +91,6 @@ def _options(
 
 def main() -> None:
     """The entry point of the program `nma`. Expected errors are printed as one line on stderr, with exit status 1."""
-    # Without a handler, SIGTERM would end the process at once, and leave incomplete files.
-    signal.signal(signal.SIGTERM, lambda number, frame: _interrupted(128 + number))
     try:
         try:
             app()
@@ -95,10 +99,10 @@ def main() -> None:
     except NmaError as e:
         _fail(str(e))
     except BrokenPipeError:
-        _close_stdout()
+        close_stdout()
         sys.exit(1)
     except OSError as e:
-        _close_stdout()
+        close_stdout()
         _fail(f"{e.filename}: {e.strerror}" if e.filename else str(e))
     except (MemoryError, RuntimeError) as e:
         # If memory runs out, Dr.Jit and JAX raise a RuntimeError.
@@ -108,7 +112,7 @@ def main() -> None:
             f"out of memory ({one_line(str(e))}); ask for less at a time: fewer pixels, materials or points"
         )
     except KeyboardInterrupt:
-        _interrupted()
+        _interrupted(None)
 
 
 def _fail(message: str) -> NoReturn:
@@ -116,22 +120,12 @@ def _fail(message: str) -> NoReturn:
     sys.exit(1)
 
 
-def _interrupted(status: int = 130) -> NoReturn:
+def _interrupted(command: str | None, status: int = 130) -> NoReturn:
     """Ends the command after Ctrl-C or SIGTERM. The exit status is 128 plus the number of the signal."""
-    print(
-        "nma: interrupted; run the same command again to continue from its stored results",
-        file=sys.stderr,
+    advice = (
+        "run the same command again to continue from its stored results"
+        if command in RESUMING
+        else "unfinished results were not written; run the command again"
     )
+    print(f"nma: interrupted; {advice}", file=sys.stderr)
     sys.exit(status)
-
-
-def _close_stdout() -> None:
-    """Redirects stdout to the null device if writing to stdout fails.
-
-    Writing fails if the reader of a pipe has ended or the disk is full. Without the redirection, Python would print
-    another error when it flushes stdout at its exit.
-    """
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
