@@ -281,8 +281,9 @@ def test_a_class_without_a_conductor_accepts_every_population():
 
 def test_classes_are_registered_by_their_names():
     assert {LAYERED3.name, MEASURED.name, LIBRARY.name} <= set(sources.classes())
-    assert all(sources.space(name).name == name for name in sources.classes())
-    assert all(sources.get(name).space == sources.space(name) for name in sources.names())
+    assert {name: sources.space(name).name for name in sources.classes()} == {n: n for n in sources.classes()}
+    for name in sources.names():
+        assert sources.get(name).space == sources.space(name)
 
 
 def test_an_unknown_class_is_refused():

@@ -3,7 +3,10 @@
 The new file contains the parameters of the class and its source. The tests use the example of docs/how-it-is-built.md.
 """
 
+import re
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +14,9 @@ import pytest
 import nma.render
 from nma import sources
 from nma.adapter import Adapter
-from nma.errors import TableError
-from nma.export import printed
-from nma.params import LAYERED3
+from nma.errors import ParamError, TableError
+from nma.export import names, printed
+from nma.params import LAYERED3, ParamSpace
 from nma.render.load import SceneError, load_dict
 from nma.table import ISOTROPIC, Tables
 from nma.table.dataset import Settings
@@ -74,6 +77,51 @@ def test_a_class_trains_with_its_own_encoding_or_with_its_plain_parameters(bare)
 def test_the_class_is_known_by_its_name(bare):
     assert {"layered3", "measured", "library", "bare"} <= set(sources.classes())
     assert sources.space("bare").name == "bare"
+
+
+def test_another_key_than_the_name_of_the_class_is_refused_at_once(bare, nma, monkeypatch):
+    monkeypatch.setattr(sources, "CLASSES", {"naked": "bare:Bare"})
+    told = "the key 'naked' of CLASSES is not the name of its class, which is 'bare'; make both names equal"
+    for use in (sources.space, sources.get):
+        with pytest.raises(ParamError, match=told):
+            use("naked")
+    code, _, err = nma("dataset", "naked", "new.zarr")
+    assert code == 1 and told in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "param", "message"),
+    [
+        ("rough-metal", "tint", "the class 'rough-metal' cannot be a name in C++; use lower-case letters"),
+        ("Metal", "tint", "the class 'Metal' cannot be a name in C++; use lower-case letters"),
+        ("float", "tint", "the class 'float' cannot be a name in C++, where 'float' has another meaning"),
+        ("layered", "tint", "the class 'layered' cannot be a name in C++, where"),
+        ("geometry", "tint", "the class 'geometry' cannot be a name in C++, where"),
+        ("bare", "columns", "the parameter 'columns' of the class 'bare' cannot be a name in C++, where"),
+        ("bare", "tint 2", "the parameter 'tint 2' of the class 'bare' cannot be a name in C++; use"),
+        ("bare", "2nd", "the parameter '2nd' of the class 'bare' cannot be a name in C++; use"),
+        ("bare", "a__b", "the parameter 'a__b' of the class 'bare' cannot be a name in C++; use"),
+    ],
+)
+def test_names_that_cpp_does_not_allow_are_not_exported(bare, monkeypatch, name, param, message):
+    space = ParamSpace(name, (replace(sources.space("bare")["tint"], name=param),))
+    monkeypatch.setattr(sources, "CLASSES", {name: "bare:Bare"})
+    monkeypatch.setattr(sources._at("bare:Bare"), "space", space)
+    for file in ("classes", "constants"):
+        with pytest.raises(ParamError, match=re.escape(message)) as caught:
+            printed(f"nma/generated/{file}.h")
+        assert "\n" not in str(caught.value)
+
+
+def test_no_class_can_have_the_name_of_a_namespace_of_the_runtime():
+    headers = [f for f in (Path(__file__).parents[1] / "runtime").rglob("*") if f.suffix in (".h", ".inl")]
+    text = "".join(file.read_text() for file in headers)
+    found = set(re.findall(r"^namespace (?:nma::)?(\w+) \{", text, re.M)) - {
+        "nma",
+        "mitsuba",
+        *sources.names(),
+    }
+    assert found and found <= names._NAMESPACES
 
 
 def test_materials_of_the_class_are_shown(bare, nma):

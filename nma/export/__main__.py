@@ -3,10 +3,15 @@
 import sys
 from pathlib import Path
 
+from nma.errors import NmaError
 from nma.export import FILES, printed
 from nma.files import write_text
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runtime")
-for name in FILES:
-    write_text(folder / name, printed(name))
-    print(folder / name)
+try:
+    contents = {name: printed(name) for name in FILES}
+    for name, content in contents.items():
+        write_text(folder / name, content)
+        print(folder / name)
+except NmaError as error:
+    sys.exit(f"nma.export: {error}")

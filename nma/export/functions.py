@@ -1,8 +1,10 @@
 """The functions, structures and constants of the target, as syntax trees.
 
 The list of functions is sorted so that each function comes after all functions that it calls. The functions use only
-what every shading language has: assignments of expressions to names, arithmetic, comparisons, calls, access to the
-fields of structures, and one return at the end. Any other construct raises an error that names its file and line.
+assignments of expressions to names, arithmetic, comparisons, calls, access to the fields of structures, and one return
+at the end, which every shading language has. Some functions, such as `spec_alpha`, return a tuple. A language without
+tuples, such as GLSL, HLSL or WGSL, needs a structure for each of these functions. Any other construct raises an error
+that names its file and line.
 """
 
 from __future__ import annotations

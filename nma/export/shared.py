@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from nma import params, sources
+from nma import params
 from nma.adapter import adapter, encoding, weights
+from nma.export.names import simulated
 from nma.params import ParamSpace
 from nma.sources import layered, layered_eval
 from nma.target import principled
@@ -34,7 +35,7 @@ def shared() -> str:
     parts.append("// The constants of the simulated layered material.")
     parts.append(_namespace("layered", _values(_LAYERED)))
     parts.append("// The index of each parameter's first number in the parameter vector of its class.")
-    parts += [_namespace(name, _columns(sources.space(name))) for name in sources.names()]
+    parts += [_namespace(name, _columns(space)) for name, space in simulated()]
     parts.append("}  // namespace nma")
     return "\n".join(parts) + "\n"
 

@@ -56,10 +56,17 @@ def names() -> tuple[str, ...]:
 
 
 def get(name: str) -> Source:
-    """The source that simulates the class `name`. Raises `ParamError` if there is no such class."""
+    """The source that simulates the class `name`. Raises `ParamError` if there is no such class, or if the key `name`
+    of `CLASSES` differs from the name of the source's class."""
     if name not in CLASSES:
         raise ParamError(f"unknown class '{name}'; known classes are {', '.join(CLASSES)}")
-    return _at(CLASSES[name])()
+    source = _at(CLASSES[name])()
+    if source.space.name != name:
+        raise ParamError(
+            f"nma/sources/__init__.py: the key '{name}' of CLASSES is not the name of its class, which is "
+            f"'{source.space.name}'; make both names equal"
+        )
+    return source
 
 
 def formats() -> dict[str, Format]:
