@@ -307,3 +307,12 @@ def test_the_commands_train_list_encode_and_extract(nma, folder, tmp_path, monke
         code, out, err = nma(*arguments)
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert words in err
+
+
+def test_a_missing_library_is_refused_with_the_command_that_makes_libraries(nma, tmp_path):
+    for words in (("list", "no"), ("extract", "no", "gold", "-o", "x.safetensors")):
+        code, _, told = nma("library", *(tmp_path / "no.safetensors" if w == "no" else w for w in words))
+        assert (
+            code == 1
+            and told == f"nma: {tmp_path}/no.safetensors: no such library; `nma train-library` makes one\n"
+        )

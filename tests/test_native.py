@@ -1,5 +1,7 @@
 """Compiling the runtime: plugins and shared library are built once and atomically, and errors say what is missing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scalar_cases import plugins
@@ -7,9 +9,10 @@ from scalar_cases import plugins
 import nma
 from nma import network
 from nma.adapter import encoding
-from nma.errors import MissingDependencyError
+from nma.errors import MissingDependencyError, ParamError
 from nma.native import build
 from nma.ops import at_azimuth_0
+from nma.render import register
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +99,23 @@ def test_python_reaches_the_functions_for_batches(tmp_path):
         runtime.prepare(params[0], cosines[:1])
     with pytest.raises(nma.errors.ParamError, match="params has 500 rows, but wi has 499 cosines"):
         runtime.prepare(params, cosines[1:])
+
+
+def test_beside_compiled_plugins_the_other_bsdfs_are_refused_with_advice(monkeypatch, tmp_path):
+    """In scalar_rgb, `nma` and `layered` are compiled, and `values` says which variant it needs."""
+    registered = {}
+    monkeypatch.setattr("mitsuba.register_bsdf", registered.__setitem__)
+    monkeypatch.setattr(register, "_add_resource", lambda folder: None)
+    monkeypatch.setattr(build, "has_mitsuba_plugins", lambda: True)
+    register._on_variant(None, "scalar_rgb")
+    assert set(registered) == set(register.PLUGINS) - set(build.PLUGINS) == {"values"}
+    with pytest.raises(
+        ParamError, match="BSDF 'values' runs in .*not in scalar_rgb.*mi.set_variant"
+    ) as caught:
+        registered["values"](SimpleNamespace(plugin_name=lambda: "values"))
+    assert "mitsuba build" not in str(caught.value)
+    monkeypatch.setattr(build, "has_mitsuba_plugins", lambda: False)
+    register._on_variant(None, "scalar_rgb")
+    assert set(registered) == set(register.PLUGINS)
+    with pytest.raises(ParamError, match="`nma mitsuba build`"):
+        registered["nma"](SimpleNamespace(plugin_name=lambda: "nma"))

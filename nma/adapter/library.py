@@ -52,6 +52,8 @@ class Library:
     def load(path: str | Path) -> Library:
         """Reads the weights file of a library. Raises `WeightsError`, which says what is wrong with the file."""
         path = weights_file(path)
+        if not path.is_file():
+            raise WeightsError(f"{path}: no such library; `nma train-library` makes one")
         adapter = Adapter.load(path)
         names = adapter.training.get("names")
         with safe_open(path, framework="numpy") as f:

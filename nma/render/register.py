@@ -41,21 +41,24 @@ def register() -> None:
 def _on_variant(old: str | None, new: str) -> None:
     import mitsuba as mi
 
+    compiled: tuple[str, ...] = ()
     if new == "scalar_rgb" and build.has_mitsuba_plugins():
-        # Python plugins of the same name would hide the compiled plugins.
         _add_resource(str(build.mitsuba_folder()))
-        return
+        compiled = build.PLUGINS
     for name, module in PLUGINS.items():
+        if name in compiled:  # a Python plugin of the same name would hide the compiled plugin
+            continue
         runs = new in VARIANTS
         mi.register_bsdf(name, importlib.import_module(module).define() if runs else partial(_refuse, new))
 
 
 def _refuse(variant: str, props: Any) -> Any:
     """Raises an error when a scene needs one of our BSDFs in a variant in which our BSDFs do not run."""
+    name = props.plugin_name()
+    other = ", or make the plugin for scalar_rgb with `nma mitsuba build`" if name in build.PLUGINS else ""
     raise ParamError(
-        f"BSDF '{props.plugin_name()}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters "
-        "are RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first, or make the plugin for "
-        "scalar_rgb with `nma mitsuba build`"
+        f"BSDF '{name}' runs in the variants {' and '.join(VARIANTS)}, not in {variant}: its parameters "
+        f"are RGB and its code is vectorised; call mi.set_variant('llvm_ad_rgb') first{other}"
     )
 
 
