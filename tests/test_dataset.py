@@ -168,6 +168,18 @@ def test_materials_depend_on_seed_and_index_alone():
     assert (other[:, 0] != params[:, 0]).all()
 
 
+@pytest.mark.parametrize("changed", [0, 23])
+def test_a_version_that_draws_another_first_or_last_material_is_refused(tmp_path, monkeypatch, changed):
+    Dataset.create(tmp_path / "old.zarr", SETTINGS)
+
+    def other(settings, indices):
+        return draw_params(settings, indices) + 0.001 * (np.array(indices) == changed)[:, None]
+
+    monkeypatch.setattr(dataset, "draw_params", other)
+    with pytest.raises(DatasetError, match="drew other parameters"):
+        Dataset.open(tmp_path / "old.zarr")
+
+
 def test_a_missing_chunk_is_refused_with_the_command_that_completes_it(copy):
     for index in (3, 4):
         os.remove(copy._chunk(index))

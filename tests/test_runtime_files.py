@@ -160,14 +160,14 @@ def test_a_folder_is_no_weights_file(tmp_path):
         (shifted(0)[:-4] + b"more" * 2, "the tensors end before the file does"),
         (of_integers("layer1.weight"), "tensor layer1.weight is not float32"),
         (with_more(np.ones(3)), "tensor more is not float32"),
-        (ranged("parameters", 3, high=1e300), "parameter 'eta_conductor' has no valid range"),
+        (ranged("parameters", 3, high=1.001e6), "parameter 'eta_conductor' has no valid range"),
         (ranged("parameters", 3, high=math.inf), "JSON"),
         (ranged("parameters", 0, low=-1.0), "parameter 'alpha_top' has no valid range"),
         (ranged("parameters", 6, low=2.0), "parameter 'sigma_t' has no valid range"),
         (ranged("parameters", 6, high=None), "'high'"),
         (ranged("target", 1, high=1e300), "target parameter 'roughness' has no valid range"),
         (ranged("target", 0, low=-5.0), "target parameter 'base_color' has no valid range"),
-        (ranged("target", 3, high=13.0), "target parameter 'specular' has no valid range"),
+        (ranged("target", 3, high=12.01), "target parameter 'specular' has no valid range"),
         (ranged("target", 3, high=math.nan), "JSON"),
         (ranged("target", 2, scale="cubic"), "unknown scale 'cubic'"),
         (ranged("target", 2, in_plane=True), "'metallic' has the flag in_plane"),
@@ -190,10 +190,45 @@ def test_unusual_but_valid_files_load(tmp_path):
         nested(32),
         with_more(np.ones((5000, 2), np.float32)),
         with_more(np.ones((0, 3), np.float32)),
+        ranged("target", 3, high=12.0),
     ):
         path.write_bytes(data)
         assert Runtime(path).parameters == 13
         assert Adapter.load(path).space.size == 13
+
+
+@pytest.mark.usefixtures("compiler")
+def test_ranges_of_parameters_may_be_as_wide_as_the_readme_says(tmp_path):
+    """The runtime knows no classes, so a class may have other ranges than the classes of the package."""
+    path = tmp_path / "wide.safetensors"
+    path.write_bytes(ranged("parameters", 3, low=-1e6, high=1e6))
+    assert Runtime(path).parameters == 13
+    path.write_bytes(ranged("parameters", 3, low=-1.001e6))
+    with pytest.raises(WeightsError, match="parameter 'eta_conductor' has no valid range"):
+        Runtime(path)
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize(
+    ("width", "message"),
+    [
+        (512, None),
+        (513, "runs at most 512 inputs"),
+        (4096, "runs at most 512 inputs"),
+        (4097, "the header has a size"),
+    ],
+)
+def test_a_network_that_is_too_wide_is_refused_with_the_limit(tmp_path, width, message):
+    path = tmp_path / "wide.safetensors"
+    adapter = random_adapter(hidden="1x8")
+    (first, _), (last, bias) = adapter.layers
+    layers = [(np.resize(first, (width, first.shape[1])), np.zeros(width, np.float32))]
+    replace(adapter, layers=[*layers, (np.resize(last, (len(bias), width)), bias)]).save(path)
+    if message is None:
+        assert Runtime(path).parameters == 13
+    else:
+        with pytest.raises(WeightsError, match=message):
+            Runtime(path)
 
 
 @pytest.mark.usefixtures("compiler")

@@ -152,6 +152,18 @@ def test_senseless_declarations_are_refused(entry):
         params_from_json([entry])
 
 
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("specular", 0.0, 12.0), ("anisotropic", -1e6, 1.0), ("fade", -1.0, 1.0), ("fade_width", 0.0, 1e6)],
+)
+def test_ranges_end_where_the_field_is_defined(name, low, high):
+    colour = {"name": "base_color", "size": 3}
+    assert params_from_json([colour, {"name": name, "low": low, "high": high}])
+    for wider in ({"low": low - 0.01, "high": high}, {"low": low, "high": high + 0.01}):
+        with pytest.raises(WeightsError, match="no valid range"):
+            params_from_json([colour, {"name": name, **wider}])
+
+
 def test_jax_decodes_to_the_same_numbers_as_numpy():
     raw = raw_outputs(2)
     expected = np.stack(numbers(decode(raw, 2)))
