@@ -8,6 +8,7 @@ from typing import Any
 
 from nma.lattice import lattice_steps
 from nma.ops import Color, Vec3, minimum, select
+from nma.render.collector import collect_postponed
 
 # The Mitsuba variants in which our Python BSDFs run. Other variants lack RGB colours or vectorised code.
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
@@ -35,6 +36,7 @@ def define_base() -> type:
         differentiable = True
 
         def __init__(self, props: mi.Properties) -> None:
+            collect_postponed()
             super().__init__(props)
             self.serial = next(_serials)
 

@@ -9,6 +9,7 @@ from typing import Any
 from nma.errors import ParamError
 from nma.native import build
 from nma.render.bsdf import VARIANTS
+from nma.render.collector import spare_recordings
 
 # Name of each plugin, and the module whose `define()` makes its class for the current variant.
 PLUGINS = {
@@ -45,10 +46,12 @@ def _on_variant(old: str | None, new: str) -> None:
     if new == "scalar_rgb" and build.has_mitsuba_plugins():
         _add_resource(str(build.mitsuba_folder()))
         compiled = build.PLUGINS
+    runs = new in VARIANTS
+    if runs:
+        spare_recordings()
     for name, module in PLUGINS.items():
         if name in compiled:  # a Python plugin of the same name would hide the compiled plugin
             continue
-        runs = new in VARIANTS
         mi.register_bsdf(name, importlib.import_module(module).define() if runs else partial(_refuse, new))
 
 
