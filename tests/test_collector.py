@@ -69,6 +69,16 @@ def test_a_collection_while_a_scene_is_recorded_does_not_crash(bsdf):
     assert done.returncode == 0, done.stderr
 
 
+def test_a_search_for_blends_keeps_no_bsdf_in_memory(no_collector):
+    before = len(common._registered())
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": BLEND}})
+    ours = next(part for part in mi.traverse(scene).hierarchy if type(part).__name__ == "Layered")
+    assert common.blended(ours)
+    assert len(common._registered()) > before
+    del scene, ours
+    assert len(common._registered()) == before
+
+
 def test_postponed_garbage_is_freed_when_the_next_bsdf_is_loaded(no_collector):
     cycle = [mi.load_dict(LAYERED)]
     serial = cycle[0].serial

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from itertools import count
 from typing import Any
 
@@ -214,8 +215,23 @@ def _parts(bsdf: Any) -> list[Any]:
 
     mi: Any = mitsuba  # Mitsuba's types change with the variant
     found: list[Any] = []
+    bsdf.traverse(_define_parts(mi.TraversalCallback, mi.BSDF)(found))
+    return found
 
-    class Parts(mi.TraversalCallback):
+
+@cache
+def _define_parts(base: Any, kind: Any) -> Any:
+    """The class of a callback that lists the objects of type `kind` inside a traversed object.
+
+    A class forms a reference cycle with its methods. If each search defined a class of its own, whose methods know the
+    list, the BSDFs of the list would stay in memory until the garbage collector runs.
+    """
+
+    class Parts(base):
+        def __init__(self, found: list[Any]) -> None:
+            super().__init__()
+            self.found = found
+
         def put(self, name, value, flags, cpptype=None):
             self.put_object(name, value, flags)
 
@@ -223,11 +239,10 @@ def _parts(bsdf: Any) -> list[Any]:
             pass
 
         def put_object(self, name, value, flags):
-            if isinstance(value, mi.BSDF):
-                found.append(value)
+            if isinstance(value, kind):
+                self.found.append(value)
                 # A new `Parts` is needed, because nanobind does not call a method of an object from within the same
                 # method.
-                value.traverse(Parts())
+                value.traverse(Parts(self.found))
 
-    bsdf.traverse(Parts())
-    return found
+    return Parts
