@@ -21,8 +21,7 @@ nma.render.use("llvm_ad_rgb")
 def _variant():
     nma.render.use("llvm_ad_rgb")
     # Frozen functions and errors form reference cycles with scenes, and only the garbage collector frees such scenes.
-    # The fixture runs the garbage collector, because Mitsuba would call deleted BSDFs if a scene were freed while
-    # Dr.Jit records another scene.
+    # The fixture runs the garbage collector, because Dr.Jit would record the BSDFs of these scenes too.
     gc.collect()
 
 
