@@ -1,5 +1,5 @@
-// The functions that tests/test_runtime_layered.py calls: densities, samples, estimates, walks and albedos of the
-// simulated material.
+// The functions that tests/test_runtime_layered.py calls: densities, samples, estimates, walks, albedos and the coat of
+// the simulated material.
 #include "nma/layered.h"
 
 #include <algorithm>
@@ -101,6 +101,14 @@ void layered_table(bool walks, int rows, int o, int p, int per_row, int seed, co
                 bins.add(row, made.direction, made.throughput);
         }
     }
+}
+
+// Writes the two results of `out_through_coat` for n pairs of directions, the rows of `wo` and `up`.
+void layered_out_through_coat(int n, const float* parameters, const float* wo, const float* up, float* out) {
+    const auto stack = layered::Stack::of(parameters);
+    for (int i = 0; i < n; ++i)
+        std::tie(out[2 * i], out[2 * i + 1]) =
+            layered::detail::out_through_coat(stack, vec(wo + 3 * i), vec(up + 3 * i));
 }
 
 void layered_albedo(const float* parameters, const float* wi, float* out) {

@@ -187,6 +187,8 @@ def test_curves_have_the_same_nodes(bridge):
 def test_curves_interpolate_every_number_between_two_nodes(bridge, tmp_path):
     """At a quarter of the distance between two nodes, all numbers and scales of a BRDF have changed by a quarter.
 
+    A cosine outside of 0 .. 1, as rounding may give, has the BRDF of the nearest end.
+
     The scales vary, because the adapter would reflect more light than it receives if its target were not bounded.
     """
     params, rng = TARGETS["stretched"], np.random.default_rng(8)
@@ -201,7 +203,7 @@ def test_curves_interpolate_every_number_between_two_nodes(bridge, tmp_path):
     made = ctypes.c_void_p(runtime._c.nma_curves_new(runtime._handle, nothing))
 
     def at(cosines):
-        brdfs = runtime.prepare(np.zeros((len(cosines), 0)), cosines)
+        brdfs = runtime.prepare(np.zeros((len(cosines), 0)), np.ones(len(cosines)))
         for brdf, cosine in zip(brdfs, cosines, strict=True):
             runtime._c.nma_curves_at(made, ctypes.c_float(cosine), pointer(brdf))
         return numbers_of(brdfs)
@@ -217,8 +219,10 @@ def test_curves_interpolate_every_number_between_two_nodes(bridge, tmp_path):
     following = numbers_of(runtime.prepare(np.zeros((last - 1, 0)), (left + 1) / last))
     assert (np.abs(following - nodes)[:, -3:] > 1e-3).any(axis=0).all()
     quarter = at((left + 0.25) / last)
+    ends, beyond = at([0.0, 0.0, 1.0, 1.0]), at([-1e-3, -0.5, 1.001, 1.5])
     runtime._c.nma_curves_free(made)
     np.testing.assert_allclose(quarter, nodes + 0.25 * (following - nodes), rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(beyond, ends)
 
 
 @pytest.mark.parametrize("instruction_set", available())
