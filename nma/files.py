@@ -34,7 +34,7 @@ def whole(path: str | Path) -> Iterator[Path]:
     The temporary file has the same suffix as `path`. Missing folders are created. If `path` exists, the new file has
     the permissions of the old file. Raises `OutputError` if the file cannot be written.
     """
-    path = Path(path)
+    path = _named(path)
     place = _place(path)
     partial = _partial(place.parent / path.name)
     try:
@@ -106,7 +106,7 @@ def try_file(*paths: str | Path) -> None:
     Raises `OutputError` if a folder or a device has the name of a file, if a file has the name of a folder, if a name
     is too long, or if the disk is full or read-only.
     """
-    for path in map(Path, paths):
+    for path in map(_named, paths):
         try:
             _check_place(path)
             place = _place(path)
@@ -117,7 +117,7 @@ def try_file(*paths: str | Path) -> None:
 
 def try_folder(path: str | Path) -> None:
     """Tests whether files can be written to a folder, which need not exist yet. Raises `OutputError`."""
-    path = Path(path)
+    path = _named(path)
     try:
         _try_folder(path)
     except OSError as error:
@@ -146,6 +146,13 @@ def into_pipe() -> Iterator[None]:
     except BrokenPipeError:
         close_stdout()
         sys.exit(1)
+
+
+def _named(path: str | Path) -> Path:
+    """The path as a `Path`. Raises `OutputError` for an empty text, which `Path` would read as the current folder."""
+    if str(path) == "":
+        raise OutputError("cannot be written (the path is empty); name a file or a folder")
+    return Path(path)
 
 
 def _try_folder(folder: Path, *names: str) -> None:

@@ -68,3 +68,12 @@ def test_a_run_survives_if_another_run_removes_its_parts(nma, tmp_path, monkeypa
     code, _, err = nma("simulate", "--draw", 2, "--walks", 1600, "-o", tmp_path / "x.npz")
     assert code == 0, err
     assert taken and [path.name for path in tmp_path.iterdir()] == ["x.npz"]
+
+
+def test_a_finished_run_deletes_only_its_own_parts(nma, tmp_path):
+    notes = tmp_path / "x.npz.parts/notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    (notes.parent / ".nma-0123456789ab.partial.npz").touch()
+    assert nma("simulate", "--draw", 1, "--walks", 1600, "-o", tmp_path / "x.npz")[0] == 0
+    assert list(notes.parent.iterdir()) == [notes]

@@ -40,7 +40,7 @@ def places(tmp_path) -> dict[str, Path]:
     }
 
 
-@pytest.mark.parametrize("path", ["", ".", "/", ".."])
+@pytest.mark.parametrize("path", [".", "/", ".."])
 @pytest.mark.parametrize("write", [try_file, lambda path: write_bytes(path, b"content")])
 def test_a_path_without_a_name_is_refused_as_a_folder(tmp_path, monkeypatch, path, write):
     for folder in (tmp_path, Path("/")):
@@ -49,6 +49,12 @@ def test_a_path_without_a_name_is_refused_as_a_folder(tmp_path, monkeypatch, pat
             OutputError, match="cannot be written .a folder has this name.; choose another place"
         ):
             write(path)
+
+
+@pytest.mark.parametrize("write", [try_file, try_folder, lambda path: write_bytes(path, b"content")])
+def test_an_empty_path_is_refused_as_empty(write):
+    with pytest.raises(OutputError, match="cannot be written .the path is empty.; name a file or a folder"):
+        write("")
 
 
 @pytest.mark.parametrize("write", [try_file, lambda path: write_bytes(path, b"content")])
@@ -110,12 +116,13 @@ def test_if_two_writers_make_a_folder_the_first_wins(tmp_path):
     assert (tmp_path / "made" / "file").read_text() == "early"
 
 
-@pytest.mark.parametrize("program", ["bench", "figures"])
-def test_a_list_ends_silently_if_the_reader_of_the_pipe_has_ended(program):
+@pytest.mark.parametrize("program", ["bench", "figures", "tools.map MAP", "nma.export FOLDER"])
+def test_a_list_ends_silently_if_the_reader_of_the_pipe_has_ended(program, tmp_path):
     """`python -m bench | head -5` prints no traceback."""
     reading, writing = os.pipe()
     os.close(reading)
-    command = [sys.executable, "-m", program]
+    name, *outputs = program.split()
+    command = [sys.executable, "-m", name, *(tmp_path / output for output in outputs)]
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")

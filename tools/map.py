@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from nma.files import write_text
+from nma.files import into_pipe, write_text
 from tools import rooms
 from tools.layout import Arrow, Layout, Place, layout
 
@@ -268,4 +268,5 @@ def _legend(p: Plan) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    with into_pipe():
+        main()

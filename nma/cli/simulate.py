@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,8 +77,17 @@ def simulate(
             tables.append(kept(part, partial(walk, vector, key), vector[None]))
             show(len(tables), walked / 1e6)
     Tables.concatenate(tables).save(output)
-    shutil.rmtree(parts, ignore_errors=True)
+    _remove(parts)
     console.say(f"{output}: {len(vectors)} material(s), {walks:,} walks each")
+
+
+def _remove(parts: Path) -> None:
+    """Deletes the stored materials, and their folder unless the user has other files in it."""
+    for pattern in ("*-????????????????-*.npz", ".nma-*.partial*"):
+        for file in parts.glob(pattern):
+            file.unlink(missing_ok=True)
+    with suppress(OSError):
+        parts.rmdir()
 
 
 def _class_of(names: list[str]) -> str:

@@ -5,13 +5,15 @@ from pathlib import Path
 
 from nma.errors import NmaError
 from nma.export import FILES, printed
-from nma.files import write_text
+from nma.files import into_pipe, write_text
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runtime")
 try:
     contents = {name: printed(name) for name in FILES}
     for name, content in contents.items():
         write_text(folder / name, content)
-        print(folder / name)
 except NmaError as error:
     sys.exit(f"nma.export: {error}")
+with into_pipe():
+    for name in contents:
+        print(folder / name)
