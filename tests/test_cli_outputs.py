@@ -65,6 +65,15 @@ def test_the_tests_find_all_commands_that_write():
     assert {("library", "encode"), ("library", "extract"), ("train-library",)} <= set(WRITING)
 
 
+@pytest.mark.parametrize(("words", "ending"), [form for form in FORMS if form[1]])
+def test_the_documentation_has_every_ending(words, ending):
+    page = (Path(__file__).parents[1] / "docs/commands.md").read_text()
+    section = page.split(f"\n## `nma {words[0]}`\n")[1].split("\n## ")[0]
+    assert ending in section, (
+        f"docs/commands.md: the section of `nma {words[0]}` must say that the output may end in `{ending}`"
+    )
+
+
 @pytest.mark.parametrize("words", WRITING, ids="-".join)
 @pytest.mark.parametrize("output", [".", "..", "/", ""])
 def test_a_folder_is_no_output(nma, bad, monkeypatch, words, output):
