@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 _TRACEBACK = "Traceback (most recent call last):"
 _LONGEST = 600  # longer messages are shortened, because some of Mitsuba's errors print whole objects
+_LONGEST_VALUE = 100
 
 
 class NmaError(Exception):
@@ -72,6 +73,12 @@ def hint(given: str, known: Sequence[str]) -> str:
     """The advice for an unknown name: a similar name, or the first of the known names."""
     near = closest(given, known)
     return f"did you mean '{near}'?" if near else f"it has {some(known)}"
+
+
+def shown(value: object) -> str:
+    """A value from a file for an error message: its `repr`, which has no control characters, shortened."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
 
 
 def one_line(message: str) -> str:

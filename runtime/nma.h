@@ -215,7 +215,7 @@ private:
                 "the adapter is anisotropic, but its lobes stretch along the plane of incidence, or its network does "
                 "not read the view direction; train again");
         if (weights_.dialect != DIALECT)
-            throw Error("the network was trained for the Principled dialect '" + weights_.dialect +
+            throw Error("the network was trained for the Principled dialect '" + shown(weights_.dialect) +
                         "', but this version evaluates '" + DIALECT + "'");
         if (weights_.instances > MAX_INSTANCES)
             throw Error("the network blends more than " + std::to_string(MAX_INSTANCES) +
@@ -321,13 +321,15 @@ public:
         }
     }
 
-    // The BRDF at any cos(theta_i), interpolated linearly between two nodes. The weights of each node sum to 1, so the
-    // interpolated weights sum to 1, too. The lobe probabilities of each node also sum to 1, and so do the interpolated
-    // probabilities. Python (nma/render/curves.py) interpolates only the instances and weights, and computes `scale`
-    // and the lobe probabilities again from the interpolated blend. This function also interpolates `scale` and the
-    // probabilities, which is faster. So the results of C++ and Python differ slightly between two nodes.
+    // The BRDF at any cos(theta_i), interpolated linearly between two nodes. NaN counts as 0. The weights of each node
+    // sum to 1, so the interpolated weights sum to 1, too. The lobe probabilities of each node also sum to 1, and so do
+    // the interpolated probabilities. Python (nma/render/curves.py) interpolates only the instances and weights, and
+    // computes `scale` and the lobe probabilities again from the interpolated blend. This function also interpolates
+    // `scale` and the probabilities, which is faster. So the results of C++ and Python differ slightly between two
+    // nodes.
     Brdf at(float cos_theta_i) const {
-        const float position = clip(cos_theta_i, 0.0f, 1.0f) * static_cast<float>(nodes_.size() - 1);
+        const float cosine = is_nan(cos_theta_i) ? 0.0f : clip(cos_theta_i, 0.0f, 1.0f);
+        const float position = cosine * static_cast<float>(nodes_.size() - 1);
         const std::size_t left = std::min(static_cast<std::size_t>(position), nodes_.size() - 2);
         const Lanes<float> t = position - static_cast<float>(left);
         const Blend<float>& a = nodes_[left].blend_;

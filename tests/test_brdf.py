@@ -90,6 +90,18 @@ def test_at_the_horizon_and_below_all_is_zero_without_a_warning(kind, precision)
         assert not np.any(stacked(value)[:, wi.z <= 0]) and not np.any(pdf[wi.z <= 0])
 
 
+@pytest.mark.parametrize("eta", [1.05, 4 / 3, 1.5, 2.0])
+def test_the_coats_reflectance_divides_by_zero_at_no_direction(eta):
+    """Below the horizon, at cos(theta_i) = -1 / sqrt(1 + eta^2), the Fresnel equations would divide by zero."""
+    z = np.array([-0.6, -1 / np.sqrt(1 + eta * eta), -1 / np.sqrt(1 + 1 / (eta * eta)), -1.0, 0.0])
+    columns = LAYERED3.sample(np.random.default_rng(0), 1)[0]
+    columns[2] = eta
+    wi = Vec3(np.sqrt(1 - z * z), 0 * z, z)
+    with np.errstate(divide="raise", invalid="raise"):
+        made = Adapter.load("layered3-3x32").prepare([np.full(len(z), x) for x in columns], wi)
+    assert np.isfinite(target.numbers(made.blend)).all()
+
+
 @pytest.mark.parametrize("azimuth", AZIMUTHS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_samples_follow_the_density_in_the_local_frame(kind, azimuth):

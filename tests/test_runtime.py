@@ -203,6 +203,21 @@ def test_curves_have_the_values_of_the_network():
         assert error.mean() < 5e-3
 
 
+def test_curves_at_nan_and_out_of_range_have_the_values_of_the_ends():
+    loaded = Runtime("layered3-3x32")
+    library = loaded._c
+    library.nma_curves_new.restype = ctypes.c_void_p
+    curves = ctypes.c_void_p(library.nma_curves_new(loaded._handle, pointer(queries(8)[0][0])))
+    cosines = (0.0, np.nan, -np.inf, -2.0, 1.0, 2.0, np.inf)
+    rows = np.zeros_like(loaded.prepare(np.tile(queries(8)[0][0], (len(cosines), 1)), np.ones(len(cosines))))
+    for row, cosine in zip(rows, cosines, strict=True):
+        library.nma_curves_at(curves, ctypes.c_float(cosine), pointer(row))
+    library.nma_curves_free(curves)
+    wi = np.tile([0.6, 0.0, 0.8], (len(cosines), 1)).astype(np.float32)
+    values = loaded.eval(rows, wi, wi)
+    np.testing.assert_array_equal(values, values[[0, 0, 0, 0, 4, 4, 4]])
+
+
 def test_samples_have_the_values_and_densities_of_eval():
     params, cosines = queries(10)
     wi = facing(cosines)

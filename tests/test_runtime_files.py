@@ -14,6 +14,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from adapter_cases import random_adapter
+from weights_cases import changed, header_of, packed, ranged, stored
 
 from nma.adapter import Adapter
 from nma.errors import ParamError, WeightsError
@@ -27,39 +28,18 @@ ROOT = Path(__file__).parent.parent
 IN_PLANE = {"name": "anisotropic", "size": 1, "low": 0, "high": 1, "scale": "linear", "in_plane": True}
 
 
-def stored(name):
-    return (ROOT / "nma/adapter/trained" / f"{name}.safetensors").read_bytes()
-
-
-def header_of(name):
-    """Returns the parts of a shipped weights file: the header, the adapter's metadata, and the bytes of the tensors."""
-    data = stored(name)
-    size = struct.unpack("<Q", data[:8])[0]
-    header = json.loads(data[8 : 8 + size])
-    return header, json.loads(header["__metadata__"]["nma"]), data[8 + size :]
-
-
-def packed(header, about, data):
-    header["__metadata__"]["nma"] = about if isinstance(about, str) else json.dumps(about)
-    text = json.dumps(header).encode()
-    return struct.pack("<Q", len(text)) + text + data
-
-
-def changed(name, **fields):
-    """Returns a weights file (bytes) with changed metadata."""
-    header, about, data = header_of(name)
-    return packed(header, about | fields, data)
+# Faulty records of a material: an object, texts, truths, and numbers outside the ranges that the source accepts.
+OTHER_PARAMS = (
+    {str(k): 0.5 for k in range(13)},
+    ["0.5"] * 13,
+    [True] * 13,
+    [5.0] * 13,
+    [-0.5] * 13,
+)
 
 
 TARGET = header_of("layered3-3x32")[1]["target"]
 BASE_COLOR = TARGET[0]
-
-
-def ranged(group, number, **fields):
-    """Returns a weights file with a changed declaration of a parameter, in the group `parameters` or `target`."""
-    about = header_of("layered3-3x32")[1]
-    about[group][number] |= fields
-    return changed("layered3-3x32", **{group: about[group]})
 
 
 def shifted(places, gap=b""):
@@ -255,12 +235,15 @@ def test_an_adapter_of_one_material_accepts_only_its_parameters(tmp_path):
         with pytest.raises(ParamError) as also_told:
             replace(adapter, training={"params": vector.tolist()}).check(np.concatenate([own, other]))
         assert str(told.value) == str(also_told.value)
-    for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13):
+    for params in ([], [1.0], [[1.0] * 13], ["a"] * 13, [1e300] * 13, *OTHER_PARAMS):
         replace(adapter, training={"params": params}).save(path)
         with pytest.raises(WeightsError, match="the recorded material does not fit the class layered3"):
             Runtime(path)
-    adapter.save(path)
-    assert Runtime(path).material is None
+        with pytest.raises(WeightsError, match="the recorded material does not fit the class layered3"):
+            Adapter.load(path)
+    for params in (None, "absent"):
+        replace(adapter, training={} if params else {"params": None}).save(path)
+        assert Runtime(path).material is None and Adapter.load(path).material is None
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -131,7 +131,7 @@ def test_neon_agrees_under_emulation(weights, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sanitizer", ["address,undefined", "thread"])
+@pytest.mark.parametrize("sanitizer", ["address,undefined,float-divide-by-zero", "thread"])
 def test_sanitizers_find_no_fault(sanitizer, tmp_path):
     flags = ["-O0", f"-fsanitize={sanitizer}", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/soak.cpp", tmp_path, *flags)
@@ -140,7 +140,7 @@ def test_sanitizers_find_no_fault(sanitizer, tmp_path):
 
 def test_sanitizers_find_no_fault_in_the_simulated_material(tmp_path):
     """Sanitizers find no fault in walks, estimates, densities and samples of random materials and of hard cases."""
-    flags = ["-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    flags = ["-O1", "-fsanitize=address,undefined,float-divide-by-zero", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/soak_layered.cpp", tmp_path, *flags)
     assert ", 0 faults" in output(program, 20_000)
 
@@ -156,7 +156,7 @@ def test_a_million_calls_have_no_fault(weights, tmp_path):
 
 @pytest.mark.slow
 def test_damaged_files_load_or_are_refused(weights, tmp_path):
-    flags = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    flags = ["-O0", "-fsanitize=address,undefined,float-divide-by-zero", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/fuzz.cpp", tmp_path, *flags)
     total, loaded = (int(w) for w in output(program, 2000, *weights).split() if w.isdigit())
     assert total == 6000

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nma import network, ops, sources
 from nma.adapter import encoding, weights
-from nma.errors import ParamError, WeightsError
+from nma.errors import ParamError, WeightsError, shown
 from nma.network import Layers
 from nma.ops import Float, Vec3
 from nma.params import ParamSpace
@@ -250,7 +250,7 @@ class Adapter:
         self._check_material(path)
         if dialect != DIALECT:
             raise WeightsError(
-                f"{path}: the adapter uses the Principled dialect '{dialect}', but this version has '{DIALECT}'"
+                f"{path}: the adapter uses the Principled dialect {shown(dialect)}, but this version has '{DIALECT}'"
             )
         if self.instances < 1:
             raise WeightsError(
@@ -278,6 +278,9 @@ class Adapter:
         """Raises `WeightsError` if the file records a single material whose parameters are not valid for the class."""
         try:
             known = self.material
+            recorded = self.training.get("params") or ()
+            if known is not None and any(type(x) not in (int, float) for x in recorded):
+                raise ParamError("the parameters are not a list of numbers")
             if known is not None and self.space.check(known).shape[1:] != known.shape:
                 raise ParamError(f"the parameters have the shape {known.shape}")
         except (ValueError, TypeError) as e:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from nma import ops
-from nma.errors import ParamError, WeightsError
+from nma.errors import ParamError, WeightsError, shown
 from nma.microfacet import fresnel_conductor, fresnel_dielectric
 from nma.ops import Float, Vec3
 from nma.params import LAYERED3, ParamSpace
@@ -68,7 +68,9 @@ def layered3(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
         unit += [fresnel_conductor(cosine, e / eta_top, x / eta_top) for e, x in zip(eta, k, strict=True)]
     unit += albedo
     if wi is not None:
-        fresnel, cos_t = fresnel_dielectric(wi.z, eta_top)
+        # Below the horizon, where nothing is reflected, the reflectance at the horizon is used, because the formula
+        # might divide by zero.
+        fresnel, cos_t = fresnel_dielectric(ops.maximum(wi.z, 0.0), eta_top)
         unit += [wi.z, fresnel, ops.exp(-sigma_t / ops.maximum(cos_t, MIN_COS_T))]
     return [2.0 * x - 1.0 for x in unit]
 
@@ -89,7 +91,7 @@ def get(name: str) -> Encoder:
     """The encoder with this name. Raises `WeightsError` if this version has no such encoder."""
     if name not in ENCODERS:
         raise WeightsError(
-            f"unknown input encoding '{name}'; this version has {', '.join(ENCODERS)}; upgrade the package"
+            f"unknown input encoding {shown(name)}; this version has {', '.join(ENCODERS)}; upgrade the package"
         )
     return ENCODERS[name]
 

@@ -8,8 +8,10 @@ object with the fields of `Header`.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+import textwrap
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from nma import sources
-from nma.errors import WeightsError
+from nma.errors import WeightsError, shown
 from nma.files import write_bytes
 from nma.network import Layers
 from nma.params import ParamSpace
@@ -68,7 +70,16 @@ def write(
     for number, (matrix, bias) in enumerate(layers):
         tensors[f"layer{number}.weight"] = np.ascontiguousarray(matrix, np.float32)
         tensors[f"layer{number}.bias"] = np.ascontiguousarray(bias, np.float32)
-    write_bytes(path, save(tensors, metadata={"nma": json.dumps(asdict(header))}))
+    write_bytes(path, save(tensors, metadata={"nma": json.dumps(_plain(asdict(header)), allow_nan=False)}))
+
+
+def _plain(data: Any) -> Any:
+    """JSON data with null in place of numbers that are not finite, which JSON does not have."""
+    if isinstance(data, dict):
+        return {key: _plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_plain(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def read(path: str | Path) -> tuple[Header, Layers]:
@@ -91,7 +102,11 @@ def read(path: str | Path) -> tuple[Header, Layers]:
             "`nma train` writes adapters"
         )
     _check_types(path, types)
-    header = _header(path, metadata["nma"])
+    try:
+        _parsed(_raw_header(path))  # safetensors itself accepts a key that occurs twice
+        header = _header(metadata["nma"])
+    except WeightsError as e:
+        raise WeightsError(f"{path}: {e}") from None
     _check_class(path, header)
     return header, _layers(path, header, tensors)
 
@@ -101,30 +116,78 @@ def _check_types(path: Path, types: Mapping[str, str]) -> None:
     for name, kind in types.items():
         if kind != "F32":
             raise WeightsError(
-                f"{path}: tensor '{name}' holds numbers of type {kind}, but this package reads only F32; convert the "
-                "file, or train again"
+                f"{path}: tensor {shown(name)} holds numbers of type {kind}, but this package reads only F32; convert "
+                "the file, or train again"
             )
 
 
-def _header(path: Path, text: str) -> Header:
+def _raw_header(path: Path) -> str:
+    """The JSON text at the beginning of a safetensors file."""
+    with path.open("rb") as file:
+        return file.read(int.from_bytes(file.read(8), "little")).decode()
+
+
+def _parsed(text: str) -> Any:
+    """Parses JSON as strictly as the C++ runtime does. Raises `WeightsError` for a key that occurs twice, because
+    readers would differ in which of the two values they take, and `ValueError` for text that is not JSON."""
+    return json.loads(text, object_pairs_hook=_fields, parse_constant=_finite, parse_float=_finite)
+
+
+def _fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise WeightsError(
+                f"the header has the key {shown(key)} twice; copy the file again or train again"
+            )
+        found[key] = value
+    return found
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"the number {shown(text)} is not finite")
+    return number
+
+
+def _header(text: str) -> Header:
     """Parses the JSON text of the header and checks the type of each field."""
     if _depth(text) > MAX_DEPTH:
         raise WeightsError(
-            f"{path}: the brackets of the metadata nest {_depth(text)} deep, but at most {MAX_DEPTH} is allowed; "
-            "train again"
+            f"the brackets of the metadata nest {_depth(text)} deep, but at most {MAX_DEPTH} is allowed; train again"
         )
     try:
-        header = Header(**json.loads(text))
+        found = _parsed(text)
+        # A later format may have other fields, so the format is checked before the fields.
+        if isinstance(found, dict):
+            _check_format(found.get("format"))
+        header = Header(**found)
+    except WeightsError:
+        raise
     except (TypeError, ValueError) as e:
         raise WeightsError(
-            f"{path}: the metadata comes from another version ({e}); upgrade the package or train again"
+            f"the metadata comes from another version ({textwrap.shorten(str(e), 200)}); upgrade the package or train "
+            "again"
         ) from None
     for name, hint in get_type_hints(Header).items():
-        if not isinstance(getattr(header, name), get_origin(hint) or hint):
+        # `isinstance` would count True as an integer.
+        if type(getattr(header, name)) is not (get_origin(hint) or hint):
             raise WeightsError(
-                f"{path}: the metadata field '{name}' has the wrong type, {getattr(header, name)!r}; train again"
+                f"the metadata field '{name}' has the wrong type, {shown(getattr(header, name))}; train again"
             )
+    if any(type(width) is not int for width in header.hidden):
+        raise WeightsError(
+            f"the metadata field 'hidden' is not a list of whole numbers, {shown(header.hidden)}; train again"
+        )
     return header
+
+
+def _check_format(found: Any) -> None:
+    if type(found) is not int or found != FORMAT:
+        raise WeightsError(
+            f"the file has format {shown(found)}, but this version reads format {FORMAT}; upgrade the package"
+        )
 
 
 def _depth(text: str) -> int:
@@ -137,21 +200,17 @@ def _depth(text: str) -> int:
 
 
 def _check_class(path: Path, header: Header) -> None:
-    """Raises `WeightsError` if this version does not support the file's format or class, or declares other parameters
+    """Raises `WeightsError` if this version does not support the file's class, or declares other parameters
     for the class."""
-    if header.format != FORMAT:
-        raise WeightsError(
-            f"{path}: the file has format {header.format}, but this version reads format {FORMAT}; upgrade the package"
-        )
     if header.class_name not in sources.classes():
         raise WeightsError(
-            f"{path}: the class '{header.class_name}' is unknown; this version has {', '.join(sources.classes())}"
+            f"{path}: the class {shown(header.class_name)} is unknown; this version has {', '.join(sources.classes())}"
         )
     space = sources.space(header.class_name)
     keys = ("name", "size", "law", "low", "high")
     for number, declared in enumerate(describe(space)):
         theirs = header.parameters[number] if number < len(header.parameters) else None
-        if not isinstance(theirs, dict) or any(theirs.get(k) != declared[k] for k in keys):
+        if not isinstance(theirs, dict) or any(_differ(theirs.get(k), declared[k]) for k in keys):
             raise WeightsError(
                 f"{path}: the file's class '{header.class_name}' differs from this version's in parameter {number}, "
                 f"{declared['name']}; use the version that wrote the file, or train again"
@@ -161,6 +220,12 @@ def _check_class(path: Path, header: Header) -> None:
             f"{path}: the file's class '{header.class_name}' has more parameters than this version's; "
             "upgrade the package"
         )
+
+
+def _differ(found: Any, declared: Any) -> bool:
+    """Whether a value of the file differs from the declared value. A number may be an integer in place of a float, but
+    true and false are not numbers."""
+    return found != declared or isinstance(found, bool) or (type(declared) is int and type(found) is not int)
 
 
 def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layers:

@@ -110,9 +110,13 @@ def params_to_json(params: Sequence[TargetParam]) -> list[dict[str, Any]]:
 
 def params_from_json(data: Sequence[dict[str, Any]]) -> tuple[TargetParam, ...]:
     """The inverse of `params_to_json`. Raises `WeightsError` for parameters that this version does not support."""
+    required = {"name", "size", "low", "high", "scale"}
     try:
+        for entry in data:
+            if missing := required - entry.keys():
+                raise TypeError(f"{sorted(missing)[0]} is missing")
         params = tuple(TargetParam(**entry) for entry in data)
-    except TypeError as e:
+    except (TypeError, AttributeError) as e:
         raise WeightsError(
             f"Target parameters are malformed ({e}); the file needs another version of nma."
         ) from e

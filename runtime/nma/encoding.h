@@ -80,7 +80,7 @@ private:
         if (name == "direction") return Kind::Direction;
         if (name == "azimuth") return Kind::Azimuth;
         if (name == "layered3") return Kind::Layered3;
-        throw Error("unknown input encoding '" + name + "'; upgrade the runtime");
+        throw Error("unknown input encoding '" + shown(name) + "'; upgrade the runtime");
     }
 
     // The parameter called `name`. Throws unless this parameter exists and has one number.
@@ -110,7 +110,9 @@ private:
         using Four = Lanes<float>;
         const float sigma_t = p[layered3::SIGMA_T], eta_top = p[layered3::ETA_TOP];
         // The Fresnel reflectance comes first, because it takes the most time.
-        const auto [fresnel, cos_t] = fresnel_dielectric<float>(cosine, eta_top);
+        // Below the horizon, where nothing is reflected, the reflectance at the horizon is used, because the formula
+        // might divide by zero.
+        const auto [fresnel, cos_t] = fresnel_dielectric<float>(maximum(cosine, 0.0f), eta_top);
         const Four transmitted = exp(maximum(Four(-sigma_t / maximum(cos_t, MIN_COS_T)), Four(-87.0f)));
         const Four one(1.0f), inside(1.0f / eta_top);
         const Four n = four(p + layered3::ETA_CONDUCTOR) * inside, k = four(p + layered3::K_CONDUCTOR) * inside;

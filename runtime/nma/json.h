@@ -5,6 +5,7 @@
 // unlike std::vector, must not contain the type `Json` before that type is complete.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <locale>
 #include <sstream>
@@ -24,6 +25,7 @@ struct Json {
     Kind kind = Kind::Null;
     bool boolean = false;
     double number = 0.0;
+    bool whole = false;  // whether the number is written without a point and without an exponent
     std::string string;
     std::vector<Json> items;         // the items of an array or of an object, in order
     std::vector<std::string> names;  // the names of an object's items, in the same order
@@ -110,7 +112,7 @@ private:
                 break;
             default:
                 made.kind = Json::Kind::Number;
-                made.number = number();
+                made.number = number(made.whole);
         }
         return made;
     }
@@ -134,6 +136,15 @@ private:
             space();
         } while (take(","));
         expect("}");
+        refuse_twins(made.names);
+    }
+
+    // Throws if a key occurs twice, because readers would differ in which of the two values they take.
+    static void refuse_twins(std::vector<std::string> keys) {
+        std::sort(keys.begin(), keys.end());
+        const auto twin = std::adjacent_find(keys.begin(), keys.end());
+        if (twin != keys.end())
+            throw Error("the header has the key '" + shown(*twin) + "' twice; copy the file again or train again");
     }
 
     void items(Json& made, int depth) {
@@ -147,18 +158,34 @@ private:
         expect("]");
     }
 
-    double number() {
+    // Reads a number by JSON's grammar, which is stricter than that of streams.
+    double number(bool& whole) {
         const std::size_t first = place_;
-        while (place_ < text_.size() &&
-               std::string_view("+-.eE0123456789").find(text_[place_]) != std::string_view::npos)
-            ++place_;
+        take("-");
+        if (!take("0")) digits();
+        whole = true;
+        if (take(".")) {
+            digits();
+            whole = false;
+        }
+        if (take("e") || take("E")) {
+            if (!take("+")) take("-");
+            digits();
+            whole = false;
+        }
         // A stream with the classic locale reads "." as the decimal point, whereas strtod would use the locale of the
         // host program.
-        std::istringstream digits(std::string(text_.substr(first, place_ - first)));
-        digits.imbue(std::locale::classic());
+        std::istringstream text(std::string(text_.substr(first, place_ - first)));
+        text.imbue(std::locale::classic());
         double found = 0.0;
-        if (!(digits >> found) || digits.peek() != std::char_traits<char>::eof()) fail("not a number");
+        if (!(text >> found)) fail("not a number");
         return found;
+    }
+
+    void digits() {
+        const std::size_t first = place_;
+        while (peek() >= '0' && peek() <= '9') ++place_;
+        if (place_ == first) fail("not a number");
     }
 
     std::string string() {
@@ -167,6 +194,7 @@ private:
         while (peek() != '"') {
             if (place_ >= text_.size()) fail("a string without an end");
             const char c = text_[place_++];
+            if (static_cast<unsigned char>(c) < 0x20) fail("a control character in a string");
             if (c == '\\') escape(made);
             else made.push_back(c);
         }
@@ -186,9 +214,9 @@ private:
     std::uint32_t hex() {
         std::uint32_t code = 0;
         for (int k = 0; k < 4; ++k, ++place_) {
-            const auto digit = std::string_view("0123456789abcdef").find(static_cast<char>(peek() | 0x20));
+            const auto digit = std::string_view("0123456789abcdefABCDEF").find(peek());
             if (digit == std::string_view::npos) fail("not four hexadecimal digits");
-            code = 16 * code + static_cast<std::uint32_t>(digit);
+            code = 16 * code + static_cast<std::uint32_t>(digit < 16 ? digit : digit - 6);
         }
         return code;
     }

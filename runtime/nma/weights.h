@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <cstring>
 #include <fstream>
+#include <initializer_list>
 #include <tuple>
 
 #include "generated/constants.h"
@@ -71,6 +72,8 @@ namespace detail {
 constexpr int WIDEST = 4096, DEEPEST = 64;
 // The largest absolute value that an end of a parameter's range may have.
 constexpr double FARTHEST = 1e6;
+// Stands for a bound that a parameter does not have.
+constexpr double UNBOUNDED = 1e30;
 // A double represents every whole number up to this value exactly.
 constexpr double MOST_BYTES = 9e15;
 
@@ -78,8 +81,7 @@ constexpr double MOST_BYTES = 9e15;
 inline std::vector<std::uint64_t> whole(const Json& array, double limit) {
     std::vector<std::uint64_t> found;
     for (const Json& item : array.items) {
-        if (item.kind != Json::Kind::Number || !(item.number >= 0 && item.number <= limit) ||
-            item.number != std::floor(item.number))
+        if (item.kind != Json::Kind::Number || !item.whole || !(item.number >= 0 && item.number <= limit))
             throw Error("the header has a size that is negative, too large or not a whole number");
         found.push_back(static_cast<std::uint64_t>(item.number));
     }
@@ -95,9 +97,9 @@ struct Place {
 
 // Reads the header's entry for a tensor. `size` is the count of bytes of the data of all tensors.
 inline Place place(const std::string& name, const Json& entry, std::size_t size) {
-    if (entry.kind != Json::Kind::Object) throw Error("the header has no valid entry for tensor " + name);
+    if (entry.kind != Json::Kind::Object) throw Error("the header has no valid entry for tensor " + shown(name));
     if (entry.at("dtype", Json::Kind::String).string != "F32")
-        throw Error("tensor " + name + " is not float32; convert the file or train again");
+        throw Error("tensor " + shown(name) + " is not float32; convert the file or train again");
     const auto range = whole(entry.at("data_offsets", Json::Kind::Array), MOST_BYTES);
     Place made{name, whole(entry.at("shape", Json::Kind::Array), MOST_BYTES), 0, 0};
     std::uint64_t bytes = sizeof(float);
@@ -107,7 +109,7 @@ inline Place place(const std::string& name, const Json& entry, std::size_t size)
         bytes = fits ? bytes * extent : 0;
     }
     if (!fits || range[1] > size || range[0] > range[1] || range[1] - range[0] != bytes)
-        throw Error("tensor " + name + " does not lie within the file, or its size contradicts its shape");
+        throw Error("tensor " + shown(name) + " does not lie within the file, or its size contradicts its shape");
     made.first = range[0];
     made.last = range[1];
     return made;
@@ -124,7 +126,7 @@ inline std::vector<Place> places(const Json& header, std::size_t size) {
     std::uint64_t end = 0;
     for (const Place& p : made) {
         if (p.first != end)
-            throw Error("tensor " + p.name +
+            throw Error("tensor " + shown(p.name) +
                         " does not begin where the tensor before it ends; copy the file again or train again");
         end = p.last;
     }
@@ -137,15 +139,16 @@ inline std::vector<Place> places(const Json& header, std::size_t size) {
 inline std::vector<float> tensor(const std::vector<Place>& places, const char* data, const std::string& name,
                                  std::size_t dimensions, std::vector<std::uint64_t>& shape) {
     const auto found = std::find_if(places.begin(), places.end(), [&](const Place& p) { return p.name == name; });
-    if (found == places.end()) throw Error("the file lacks tensor " + name + "; copy the file again or train again");
+    if (found == places.end())
+        throw Error("the file lacks tensor " + shown(name) + "; copy the file again or train again");
     shape = found->shape;
     if (shape.size() != dimensions || *std::max_element(shape.begin(), shape.end()) > WIDEST)
-        throw Error("tensor " + name + " has the wrong number of dimensions, or a size above " +
+        throw Error("tensor " + shown(name) + " has the wrong number of dimensions, or a size above " +
                     std::to_string(WIDEST));
     std::vector<float> values((found->last - found->first) / sizeof(float));
     if (!values.empty()) std::memcpy(values.data(), data + found->first, values.size() * sizeof(float));
     for (const float v : values)
-        if (!is_finite(v)) throw Error("tensor " + name + " holds numbers that are not finite; train again");
+        if (!is_finite(v)) throw Error("tensor " + shown(name) + " holds numbers that are not finite; train again");
     return values;
 }
 
@@ -169,23 +172,36 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
 
 // The value of the field `name`, which must be a whole number in 1 .. most.
 inline int small(const Json& entry, std::string_view name, int most) {
-    const double n = entry.at(name, Json::Kind::Number).number;
-    if (!(n >= 1 && n <= most) || n != std::floor(n))
+    const Json& found = entry.at(name, Json::Kind::Number);
+    const double n = found.number;
+    if (!found.whole || !(n >= 1 && n <= most))
         throw Error("in the metadata, '" + std::string(name) + "' is not a whole number in 1 .. " +
                     std::to_string(most));
     return static_cast<int>(n);
 }
 
-// Whether the field `name` exists and is true.
+// The value of the field `name`, which must be true or false. The value is false if the field is missing.
 inline bool flag(const Json& entry, std::string_view name) {
-    const Json* found = entry.find(name);
-    return found && found->kind == Json::Kind::Boolean && found->boolean;
+    return entry.find(name) && entry.at(name, Json::Kind::Boolean).boolean;
 }
 
 // The values of the fields `low` and `high`. These values are finite, because JSON has no infinity, and `Json::parse`
 // rejects numbers that are too large for a double.
 inline std::pair<double, double> range(const Json& entry) {
     return {entry.at("low", Json::Kind::Number).number, entry.at("high", Json::Kind::Number).number};
+}
+
+// Throws if `entry` has a field that is not `known`. An unknown field may change the meaning of the other fields.
+inline void only(const Json& entry, std::initializer_list<std::string_view> known) {
+    for (const std::string& name : entry.names)
+        if (std::find(known.begin(), known.end(), name) == known.end())
+            throw Error("the metadata has the unknown field '" + shown(name) + "'; upgrade the runtime or train again");
+}
+
+// The value of the field `name`, or `without` if the field is null or missing.
+inline double bound(const Json& entry, std::string_view name, double without) {
+    const Json* found = entry.find(name);
+    return found && found->kind != Json::Kind::Null ? entry.at(name, Json::Kind::Number).number : without;
 }
 
 inline SourceParam source_param(const Json& entry) {
@@ -195,7 +211,7 @@ inline SourceParam source_param(const Json& entry) {
     p.logarithmic = entry.at("law", Json::Kind::String).string == "log10";
     std::tie(p.low, p.high) = range(entry);
     if (!(-FARTHEST <= p.low && p.low <= p.high && p.high <= FARTHEST) || (p.logarithmic && !(p.low > 0)))
-        throw Error("parameter '" + p.name + "' has no valid range");
+        throw Error("parameter '" + shown(p.name) + "' has no valid range");
     if (p.low < p.high) {
         p.start = static_cast<float>(p.logarithmic ? std::log(p.low) : p.low);
         p.per_range = static_cast<float>(1.0 / (p.logarithmic ? std::log(p.high / p.low) : p.high - p.low));
@@ -207,11 +223,12 @@ inline SourceParam source_param(const Json& entry) {
 inline const Field& field(const std::string& name, int size) {
     for (const Field& f : FIELDS)
         if (f.name == name && f.size == size) return f;
-    throw Error("unknown target parameter '" + name + "'; upgrade the runtime");
+    throw Error("unknown target parameter '" + shown(name) + "'; upgrade the runtime");
 }
 
 inline TargetParam target_param(const Json& entry) {
     TargetParam p;
+    only(entry, {"name", "size", "low", "high", "scale", "in_plane"});
     p.name = entry.at("name", Json::Kind::String).string;
     p.size = small(entry, "size", 3);
     std::tie(p.low, p.high) = range(entry);
@@ -220,11 +237,12 @@ inline TargetParam target_param(const Json& entry) {
     p.in_plane = flag(entry, "in_plane");
     const Field& known = field(p.name, p.size);
     if (!(known.low <= p.low && p.low < p.high && p.high <= known.high) || (p.logarithmic && !(p.low > 0)))
-        throw Error("target parameter '" + p.name + "' has no valid range");
+        throw Error("target parameter '" + shown(p.name) + "' has no valid range");
     if (!p.logarithmic && scale != "linear")
-        throw Error("target parameter '" + p.name + "' has the unknown scale '" + scale + "'");
+        throw Error("target parameter '" + shown(p.name) + "' has the unknown scale '" + shown(scale) + "'");
     if (p.in_plane && p.name != "anisotropic")
-        throw Error("target parameter '" + p.name + "' has the flag in_plane, which only 'anisotropic' may have");
+        throw Error("target parameter '" + shown(p.name) +
+                    "' has the flag in_plane, which only 'anisotropic' may have");
     return p;
 }
 
@@ -245,17 +263,33 @@ inline std::vector<TargetParam> target_params(const Json& about) {
 // The parameters of the single material that the network was fitted to, from the file's record of its training. The
 // result is empty if the network reads parameters, or if the file has no record of a material.
 inline std::vector<float> material(const Json& about, const Weights& made) {
-    std::size_t size = 0;
-    for (const SourceParam& p : made.parameters) size += static_cast<std::size_t>(p.size);
+    // For each number of the material: its parameter, with the range that the class's source accepts.
+    std::vector<SourceParam> valid;
+    for (std::size_t k = 0; k < made.parameters.size(); ++k) {
+        const Json& entry = about.at("parameters", Json::Kind::Array).items[k];
+        SourceParam p = made.parameters[k];
+        p.low = bound(entry, "valid_low", -UNBOUNDED);
+        p.high = bound(entry, "valid_high", UNBOUNDED);
+        valid.insert(valid.end(), static_cast<std::size_t>(p.size), p);
+    }
+    const std::size_t size = valid.size();
     const Json* training = about.find("training");
+    if (training) about.at("training", Json::Kind::Object);
     const Json* fitted = training ? training->find("params") : nullptr;
-    if (!fitted || !size || (made.encoding != "direction" && made.encoding != "azimuth")) return {};
+    if (!fitted || fitted->kind == Json::Kind::Null || !size ||
+        (made.encoding != "direction" && made.encoding != "azimuth"))
+        return {};
     std::vector<float> found;
-    for (const Json& item : fitted->items)
-        if (item.kind == Json::Kind::Number && absolute(item.number) <= 1e30)
-            found.push_back(static_cast<float>(item.number));
+    if (fitted->kind == Json::Kind::Array)
+        for (const Json& item : fitted->items) {
+            if (item.kind != Json::Kind::Number || absolute(item.number) > UNBOUNDED || found.size() == size) break;
+            const float x = static_cast<float>(item.number);
+            if (!valid[found.size()].allows(x)) break;
+            found.push_back(x);
+        }
     if (found.size() != size || fitted->items.size() != size)
-        throw Error("the recorded material does not fit the class " + made.class_name + "; fit the adapter again");
+        throw Error("the recorded material does not fit the class " + shown(made.class_name) +
+                    "; fit the adapter again");
     return found;
 }
 
@@ -268,13 +302,17 @@ inline Weights weights(const char* bytes, std::size_t size) {
     const Json header = Json::parse({bytes + 8, static_cast<std::size_t>(length)});
     const Json& metadata = header.at("__metadata__", Json::Kind::Object);
     const Json about = Json::parse(metadata.at("nma", Json::Kind::String).string);
-    if (about.at("format", Json::Kind::Number).number != FORMAT)
+    const Json& format = about.at("format", Json::Kind::Number);
+    if (!format.whole || format.number != FORMAT)
         throw Error("the file has a format that this version does not read; upgrade the runtime");
+    only(about, {"class_name", "parameters", "encoding", "hidden", "instances", "directional", "reciprocal", "dialect",
+                 "target", "bounded", "training", "format"});
+    about.at("reciprocal", Json::Kind::Boolean);
     Weights made;
     made.class_name = about.at("class_name", Json::Kind::String).string;
     made.encoding = about.at("encoding", Json::Kind::String).string;
     made.dialect = about.at("dialect", Json::Kind::String).string;
-    made.directional = flag(about, "directional");
+    made.directional = about.at("directional", Json::Kind::Boolean).boolean;
     made.bounded = flag(about, "bounded");
     for (const Json& entry : about.at("parameters", Json::Kind::Array).items)
         made.parameters.push_back(source_param(entry));

@@ -1,0 +1,121 @@
+"""The readers of weights files in Python and in C++ refuse the same faulty headers."""
+
+import json
+import math
+import re
+import struct
+
+import pytest
+from weights_cases import changed, header_of, packed, ranged, stored
+
+from nma.adapter import Adapter
+from nma.errors import WeightsError
+from nma.native.runtime import Runtime
+
+
+def written(old, new):
+    """Returns a weights file in whose metadata the text `old` is replaced by `new`, once."""
+    header, about, data = header_of("layered3-3x32")
+    text = json.dumps(about)
+    assert old in text
+    return packed(header, text.replace(old, new, 1), data)
+
+
+def without(name):
+    """Returns a weights file whose metadata lacks a field."""
+    header, about, data = header_of("layered3-3x32")
+    del about[name]
+    return packed(header, about, data)
+
+
+def tensor_twice():
+    """Returns a weights file whose header has the entry of one tensor twice."""
+    data = stored("layered3-3x32")
+    size = struct.unpack("<Q", data[:8])[0]
+    entry = '"layer0.bias": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}, '
+    text = ("{" + entry).encode() + data[9 : 8 + size]
+    return struct.pack("<Q", len(text)) + text + data[8 + size :]
+
+
+KINDS = {
+    "a flag is 1": ranged("target", 2, in_plane=1),
+    "a flag is null": ranged("target", 2, in_plane=None),
+    "a flag is text": changed("layered3-3x32", bounded="true"),
+    "bounded is 1": changed("layered3-3x32", bounded=1),
+    "bounded is null": changed("layered3-3x32", bounded=None),
+    "directional is 1": changed("layered3-3x32", directional=1),
+    "reciprocal is null": changed("layered3-3x32", reciprocal=None),
+    "format is true": changed("layered3-3x32", format=True),
+    "format is 1.0": changed("layered3-3x32", format=1.0),
+    "instances is 2.0": changed("layered3-3x32", instances=2.0),
+    "instances is text": changed("layered3-3x32", instances="2"),
+    "hidden has fractions": changed("layered3-3x32", hidden=[32.0, 32.0, 32.0]),
+    "hidden has truths": changed("layered3-3x32", hidden=[True, 32, 32]),
+    "a size is true": ranged("parameters", 0, size=True),
+    "a size is 3.0": ranged("target", 0, size=3.0),
+    "a low end is false": ranged("target", 2, low=False),
+    "a low end is missing": written(
+        '"name": "metallic", "size": 1, "low": 0.0,', '"name": "metallic", "size": 1,'
+    ),
+    "a scale is null": ranged("target", 2, scale=None),
+    "a name is a list": ranged("target", 2, name=["metallic"]),
+    "the class is a number": changed("layered3-3x32", class_name=3),
+    "the target is an object": changed("layered3-3x32", target={}),
+    "the training is a list": changed("layered3-3x32", training=[]),
+    "a field of the target is unknown": ranged("target", 2, colour=1),
+    "a field is unknown": changed("layered3-3x32", colour=1),
+    "the format is missing": without("format"),
+    "the direction is missing": without("directional"),
+    "a number is NaN": changed("layered3-3x32", training={"loss": math.nan}),
+    "a number is too large": written('"training": {', '"training": {"loss": 1e400, '),
+    "a number starts with 0": written('"low": 0.0', '"low": 00.0'),
+    "a number has a plus": written('"low": 0.0', '"low": +0.0'),
+    "a text has a tab": written("layered3", "lay\tered3"),
+}
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize("fault", KINDS)
+def test_both_readers_refuse_values_of_another_kind(tmp_path, fault):
+    """A flag, a number, a text or a list that has another kind of JSON value is refused in Python and in C++."""
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(KINDS[fault])
+    for reader in (Adapter.load, Runtime):
+        with pytest.raises(WeightsError, match=re.escape(f"{path}: ")):
+            reader(path)
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize(
+    "key, data",
+    [
+        ("in_plane", written('"in_plane": false', '"in_plane": true, "in_plane": false')),
+        ("instances", written('"instances": 2', '"instances": 2, "instances": 2')),
+        ("layer0.bias", tensor_twice()),
+    ],
+)
+def test_both_readers_refuse_a_key_that_occurs_twice(tmp_path, key, data):
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(data)
+    for reader in (Adapter.load, Runtime):
+        with pytest.raises(WeightsError) as told:
+            reader(path)
+        assert (
+            str(told.value)
+            == f"{path}: the header has the key '{key}' twice; copy the file again or train again"
+        )
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize("name", ["\x1b[31mred\n", "x" * 100_000])
+def test_names_of_a_file_are_shortened_and_have_no_escape_codes(tmp_path, name):
+    path = tmp_path / "bad.safetensors"
+    for reader, faults in (
+        (Adapter.load, ("class_name", "encoding", "dialect")),
+        (Runtime, ("encoding", "dialect")),
+    ):
+        for fault in faults:
+            path.write_bytes(changed("layered3-3x32", **{fault: name}))
+            with pytest.raises(WeightsError) as told:
+                reader(path)
+            assert str(told.value).isprintable() and len(str(told.value)) < 400, (reader, fault)
