@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import secrets
 import shutil
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,29 @@ _ADVICE = {
     errno.EDQUOT: "free some space, or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
+# The functions that `clean_up` calls.
+_CLEANERS: list[Callable[[], None]] = []
+
+
+@contextmanager
+def cleaning(cleaner: Callable[[], None]) -> Iterator[None]:
+    """A context manager: while the `with` block runs, `clean_up` calls `cleaner`, which deletes temporary files.
+
+    `cleaner` is not called at the end of the block.
+    """
+    _CLEANERS.append(cleaner)
+    try:
+        yield
+    finally:
+        _CLEANERS.remove(cleaner)
+
+
+def clean_up() -> None:
+    """Deletes the temporary files and folders of this process. A signal handler that ends the process calls this
+    function."""
+    for cleaner in reversed(_CLEANERS.copy()):
+        with suppress(Exception):
+            cleaner()
 
 
 @contextmanager
@@ -36,19 +62,16 @@ def whole(path: str | Path) -> Iterator[Path]:
     """
     path = _named(path)
     place = _place(path)
-    partial = _partial(place.parent / path.name)
     try:
-        _check_place(path)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        if place.exists():
-            shutil.copymode(place, partial)
-        partial.replace(place)
+        with _temporary(place.parent / path.name) as partial:
+            _check_place(path)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            yield partial
+            if place.exists():
+                shutil.copymode(place, partial)
+            partial.replace(place)
     except OSError as error:
         raise _refused(path, error) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -59,19 +82,17 @@ def whole_folder(path: Path) -> Iterator[Path]:
     If another process has created the folder `path` in the meantime, that folder stays and the temporary folder is
     deleted.
     """
-    partial = _partial(path)
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        try:
-            partial.rename(path)
-        except OSError:
-            if not path.is_dir():
-                raise
+        with _temporary(path) as partial:
+            partial.mkdir(parents=True)
+            yield partial
+            try:
+                partial.rename(path)
+            except OSError:
+                if not path.is_dir():
+                    raise
     except OSError as error:
         raise _refused(path, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
@@ -83,6 +104,19 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def write_text(path: str | Path, content: str) -> None:
     """Writes text to a file as UTF-8, completely or not at all, as `whole` does."""
     write_bytes(path, content.encode())
+
+
+@cache
+def scratch_folder() -> Path:
+    """A temporary folder of this process, which is deleted when the process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="nma-"))
+
+    def delete() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(delete)
+    _CLEANERS.append(delete)
+    return folder
 
 
 @contextmanager
@@ -166,12 +200,8 @@ def _try_folder(folder: Path, *names: str) -> None:
         # A name that is too long is invalid in every folder, so `lstat` can test the name in this folder.
         with suppress(FileNotFoundError):
             os.lstat(folder / name)
-    trial = _partial(folder / "trial")
-    try:
+    with _temporary(folder / "trial") as trial:
         trial.write_bytes(_TRIAL)
-    finally:
-        with suppress(OSError):
-            trial.unlink(missing_ok=True)
 
 
 def _place(path: Path) -> Path:
@@ -188,9 +218,22 @@ def _check_place(path: Path) -> None:
         raise OSError(errno.EINVAL, "this is not a regular file")
 
 
-def _partial(path: Path) -> Path:
-    """A short, unique name for a temporary file in the folder of `path`, with the suffix of `path`."""
-    return path.parent / f".nma-{secrets.token_hex(6)}.partial{path.suffix}"
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """A context manager: the `with` block gets a path for a temporary file or folder, which is deleted when the block
+    ends. The path has a short, unique name, is in the folder of `path`, and has the suffix of `path`."""
+    partial = path.parent / f".nma-{secrets.token_hex(6)}.partial{path.suffix}"
+
+    def delete() -> None:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
+
+    with cleaning(delete):
+        try:
+            yield partial
+        finally:
+            delete()
 
 
 def _refused(path: Path, error: OSError) -> NmaError:

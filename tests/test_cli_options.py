@@ -1,7 +1,5 @@
 """The options of all commands declare bounds or choices, and refuse all other values."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -117,35 +115,6 @@ def test_a_network_is_refused_before_a_material_is_simulated(nma, tmp_path, monk
 
 def test_the_version_is_printed(nma):
     assert nma("--version") == (0, f"nma {package.__version__}\n", "")
-
-
-def test_a_terminated_command_deletes_its_partial_files(tmp_path):
-    """If a command gets the signal SIGTERM, it deletes partly written files and ends, as on Ctrl-C.
-
-    Job queues send SIGTERM to stop a job, and a system sends SIGTERM when it shuts down.
-    """
-    code = """
-import sys, time
-from nma import cli, files, materials
-def names():
-    with files.whole("x.txt") as file:
-        file.write_text("half")
-        print("writing", flush=True)
-        time.sleep(60)
-materials.names = names
-sys.argv = ["nma", "materials"]
-cli.main()
-"""
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout.readline() == "writing\n"
-    assert len(list(tmp_path.iterdir())) == 1
-    process.terminate()
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err.count("\n")) == (143, 1)
-    assert "unfinished results were not written; run the command again" in err
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_interrupted_command_says_whether_the_next_run_continues(nma, tmp_path, monkeypatch):

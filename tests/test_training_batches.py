@@ -18,7 +18,9 @@ from training_cases import FALSE_ALARM, TINY, batch_of, lambertian
 
 from nma.table import ISOTROPIC, Grid
 from nma.table.dataset import Settings, simulate_block
+from nma.train import loop
 from nma.train.batches import Batch, BinSampler, Pool, Stream, batches
+from nma.train.recipe import preset
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +128,18 @@ def test_a_consumer_that_leaves_early_leaves_no_thread():
     next(stream)
     stream.close()
     assert threading.active_count() == before
+
+
+def test_a_training_that_fails_leaves_no_thread(monkeypatch):
+    """The traceback of an error keeps the generator alive, so the training itself must close the generator."""
+    monkeypatch.setattr(
+        loop, "_group", lambda state, group, scale, recipe, objective: (state, np.ones((5, 2)))
+    )
+    recipe = preset("single", steps=10**9)
+    before = threading.active_count()
+    with pytest.raises(ZeroDivisionError) as error:
+        loop.train(recipe, loop.Run(None), lambda step: Batch(*[np.ones(2)] * 13), progress=lambda run: 1 / 0)
+    assert error.value.__traceback__ and threading.active_count() == before
 
 
 def test_errors_of_the_preparing_thread_reach_the_caller():

@@ -7,7 +7,6 @@ to `COMMANDS`.
 
 from __future__ import annotations
 
-import signal
 import sys
 from importlib import import_module
 from typing import Annotated, Any, NoReturn
@@ -16,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 import nma
+from nma.cli import signals
 from nma.errors import NmaError, one_line
 from nma.files import close_stdout
 
@@ -24,12 +24,10 @@ class _Commands(TyperGroup):
     """The group of all commands, which prints a message on Ctrl-C; typer alone prints none."""
 
     def invoke(self, ctx: Any) -> Any:
-        # Without a handler, SIGTERM would end the process at once, and leave incomplete files.
-        signal.signal(
-            signal.SIGTERM, lambda number, frame: _interrupted(ctx.invoked_subcommand, 128 + number)
-        )
         try:
-            return super().invoke(ctx)
+            with signals.handled(lambda: _interruption(ctx.invoked_subcommand)):
+                return super().invoke(ctx)
+        # In a thread, where no signal is handled, the code that started the thread may raise a KeyboardInterrupt.
         except KeyboardInterrupt:
             _interrupted(ctx.invoked_subcommand)
 
@@ -120,12 +118,17 @@ def _fail(message: str) -> NoReturn:
     sys.exit(1)
 
 
-def _interrupted(command: str | None, status: int = 130) -> NoReturn:
-    """Ends the command after Ctrl-C or SIGTERM. The exit status is 128 plus the number of the signal."""
+def _interruption(command: str | None) -> str:
+    """What to print when a command is interrupted."""
     advice = (
         "run the same command again to continue from its stored results"
         if command in RESUMING
         else "unfinished results were not written; run the command again"
     )
-    print(f"nma: interrupted; {advice}", file=sys.stderr)
-    sys.exit(status)
+    return f"interrupted; {advice}"
+
+
+def _interrupted(command: str | None) -> NoReturn:
+    """Ends the command after a `KeyboardInterrupt` that no signal handler of `nma.cli.signals` has replaced."""
+    print(f"nma: {_interruption(command)}", file=sys.stderr)
+    sys.exit(130)

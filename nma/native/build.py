@@ -15,14 +15,16 @@ import importlib.metadata
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from nma.errors import MissingDependencyError, NmaError
-from nma.files import whole_folder
+from nma.files import cleaning, whole_folder
 
 PLUGINS = ("nma", "layered")
 _ADAPTERS = Path(__file__).parent.parent / "adapter" / "trained"
@@ -144,9 +146,24 @@ def _leave_undefined() -> str:
 
 def _compile(words: Sequence[str | Path], flags: Sequence[str]) -> None:
     command = [compiler(), *map(str, words), *flags]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    if run.returncode:
-        errors = [line for line in run.stderr.splitlines() if "error" in line] or run.stderr.splitlines()
+    # The compiler's programs form a process group of their own, so that all of them can be ended together.
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", process_group=0
+    ) as process:
+
+        def end() -> None:
+            with suppress(OSError, subprocess.TimeoutExpired):
+                os.killpg(process.pid, signal.SIGTERM)
+                process.wait(2.0)
+
+        with cleaning(end):
+            try:
+                _, told = process.communicate()
+            except BaseException:
+                end()
+                raise
+    if process.returncode:
+        errors = [line for line in told.splitlines() if "error" in line] or told.splitlines()
         raise BuildError(f"{' '.join(command[:2])}: {'; '.join(errors[:2])}")
 
 

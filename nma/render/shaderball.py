@@ -9,9 +9,6 @@ The shell's outer radius is 1. The z axis points up, and the ring that carries t
 
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nma.files import write_bytes
+from nma.files import scratch_folder, write_bytes
 
 Array = NDArray[np.float64]
 
@@ -105,7 +102,7 @@ def revolve(profile: Array, turns: int, steps: int, axis: Array, *, repeats: int
 def shader_ball_file(detail: float = 1.0) -> Path:
     """The path of a binary PLY file of the shader ball. The first call writes the file to this process's temporary
     folder."""
-    path = _scratch_folder() / f"shaderball-{detail:g}.ply"
+    path = scratch_folder() / f"shaderball-{detail:g}.ply"
     write_ply(path, shader_ball(detail))
     return path
 
@@ -120,13 +117,6 @@ def write_ply(path: Path, mesh: Mesh) -> None:
     face["count"], face["index"] = 3, mesh.faces
     vertex = np.concatenate([mesh.vertices, mesh.normals, mesh.uv], axis=1).astype("<f4")
     write_bytes(path, "\n".join([*header, ""]).encode() + vertex.tobytes() + face.tobytes())
-
-
-@lru_cache(maxsize=1)
-def _scratch_folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="nma-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
 
 
 def _arc(radius: float | Array, start: float, stop: float, count: int = 2000) -> Array:

@@ -6,7 +6,7 @@ The batch of a step depends only on the seed and the step.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, Queue
@@ -193,10 +193,12 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
     )
 
 
-def batches(source: Callable[[int], Any], start: int, stop: int, group: int) -> Iterator[tuple[int, Any]]:
+def batches(
+    source: Callable[[int], Any], start: int, stop: int, group: int
+) -> Generator[tuple[int, Any], None, None]:
     """Yields (first step, stacked batches of `group` steps) from `start` to `stop`.
 
-    A thread prepares the batches in advance.
+    A thread prepares the batches in advance. Close the generator to end the thread.
     """
     queue: Queue = Queue(maxsize=2)
     stopped = threading.Event()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -84,27 +85,29 @@ def train(
     """
     saved = began = time.perf_counter()
     before = run.seconds
-    for _first, group in batches(source, run.step, recipe.steps, GROUP):
-        run.state, values = _group(run.state, group, run.scale, recipe, objective)
-        values = np.asarray(values)
-        if not np.isfinite(values).all():
-            raise NmaError(
-                f"the loss is not finite at step {run.step + int(np.argmin(np.isfinite(values[:, 0])))}; "
-                "lower the learning rate, or resume from the last checkpoint with another seed"
-            )
-        run.losses += values[:, 0].tolist()
-        run.log_losses += values[:, 1].tolist()
-        run.step += len(values)
-        now = time.perf_counter()
-        run.seconds = before + now - began
-        if recipe.schedule == "plateau":
-            run.scale = _plateau(run)
-        if checkpoint and now - saved > _CHECKPOINT_SECONDS:
-            save(run, recipe, checkpoint)
-            saved = now
-        progress(run)
-        if run.seconds > budget_seconds or run.scale < _MIN_SCALE:
-            break
+    # After an error, the thread that prepares batches would otherwise run until the interpreter exits.
+    with closing(batches(source, run.step, recipe.steps, GROUP)) as groups:
+        for _first, group in groups:
+            run.state, values = _group(run.state, group, run.scale, recipe, objective)
+            values = np.asarray(values)
+            if not np.isfinite(values).all():
+                raise NmaError(
+                    f"the loss is not finite at step {run.step + int(np.argmin(np.isfinite(values[:, 0])))}; "
+                    "lower the learning rate, or resume from the last checkpoint with another seed"
+                )
+            run.losses += values[:, 0].tolist()
+            run.log_losses += values[:, 1].tolist()
+            run.step += len(values)
+            now = time.perf_counter()
+            run.seconds = before + now - began
+            if recipe.schedule == "plateau":
+                run.scale = _plateau(run)
+            if checkpoint and now - saved > _CHECKPOINT_SECONDS:
+                save(run, recipe, checkpoint)
+                saved = now
+            progress(run)
+            if run.seconds > budget_seconds or run.scale < _MIN_SCALE:
+                break
     if checkpoint:
         save(run, recipe, checkpoint)
     return run
