@@ -1,12 +1,15 @@
 """`nma simulate` writes reference files, and resumes after an interruption."""
 
+import dataclasses
 import errno
 import shutil
 from pathlib import Path
 
 import numpy as np
 
-from nma import table
+from nma import sources, table
+from nma.params import LAYERED3
+from nma.sources.layered import Layered3
 from nma.table import Tables
 
 
@@ -49,6 +52,44 @@ def test_a_damaged_part_is_simulated_again(nma, tmp_path):
     assert code == 0, err
     np.testing.assert_array_equal(Tables.load(output).values, Tables.load(tmp_path / "right.npz").values)
     assert not parts.exists()
+
+
+def test_only_a_part_of_the_same_simulation_is_used_again(nma, tmp_path, monkeypatch):
+    """The parts of an interrupted run are not used for another material, other walks, another seed or another class.
+
+    In this test, all runs leave their parts. A run that equals the run before simulates nothing.
+    """
+
+    class Other(Layered3):
+        space = dataclasses.replace(LAYERED3, name="other")
+
+    made = []
+
+    def blank(source, params, walks, keys):
+        made.append(keys)
+        return Tables(params, np.zeros((1, 2, 2, 2, 3)), np.array([walks]), None, source.space.name)
+
+    monkeypatch.setattr(sources, "get", lambda name: Other() if name == "other" else Layered3())
+    monkeypatch.setattr(shutil, "rmtree", lambda *arguments, **options: None)
+    monkeypatch.setattr(table, "tabulate", blank)
+    files = [tmp_path / f"{k}.npz" for k in range(2)]
+    for k, path in enumerate(files):
+        np.savez(path, params=LAYERED3.sample(np.random.default_rng(k), 1))
+    first = {"--params": files[0], "--walks": 100, "--seed": 1, "--class": "layered3"}
+    for number, change in enumerate(
+        ({"--params": files[1]}, {"--walks": 200}, {"--seed": 2}, {"--class": "other"})
+    ):
+        output = tmp_path / f"output-{number}.npz"
+        for options, simulated in ((first, 1), (first | change, 1), (first | change, 0)):
+            made.clear()
+            code, _, err = nma(
+                "simulate", *(word for option in options.items() for word in option), "-o", output
+            )
+            assert code == 0, err
+            assert len(made) == simulated, options
+            found = Tables.load(output)
+            np.testing.assert_array_equal(found.params, np.load(options["--params"])["params"])
+            assert (found.class_name, *found.walks) == (options["--class"], options["--walks"])
 
 
 def test_a_run_survives_if_another_run_removes_its_parts(nma, tmp_path, monkeypatch):

@@ -146,6 +146,31 @@ def test_gradients_of_direct_light_are_finite_differences(name, tmp_path):
         assert np.abs(expected).min() > 1e-4
 
 
+@pytest.mark.parametrize("before", (False, True), ids=("alone", "after a call without derivatives"))
+def test_a_call_with_derivatives_does_not_reuse_a_brdf_without_derivatives(before, tmp_path):
+    """While Dr.Jit records a kernel, a call inside `dr.suspend_grad` and the next call have the same arguments.
+
+    The BSDF keeps the BRDF of the first call. A failure means that the next call uses this BRDF and has no derivatives.
+    """
+    bsdf, _ = case("textured", tmp_path)
+    loaded, ctx, wo = mi.load_dict(bsdf), mi.BSDFContext(), mi.Vector3f(0.0, 0.6, 0.8)
+    params = mi.traverse(loaded)
+    dr.enable_grad(params["albedo.data"])
+    params.update()
+
+    def recorded(si):
+        if before:
+            with dr.suspend_grad():
+                loaded.eval(ctx, si, wo)
+        return loaded.eval(ctx, si, wo).x
+
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.wi = dr.opaque(mi.Vector3f, (0.6, 0.0, 0.8), 2)
+    value = dr.switch(dr.arange(mi.UInt32, 2), [recorded, lambda si: mi.Float(0.0)], si)
+    dr.backward(value)
+    assert np.abs(np.array(dr.grad(params["albedo.data"]))).max() > 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_of_all_light_are_finite_differences(name, tmp_path):
