@@ -145,6 +145,52 @@ def test_inputs_are_attributes_and_may_come_from_one_channel(kind):
     )
 
 
+def test_the_back_and_lobes_that_nobody_asks_for_are_black():
+    """All methods return zeros for the back, and for contexts without glossy reflection or with another component."""
+    finished(
+        """
+    rest, other = mi.BSDFContext(), mi.BSDFContext()
+    rest.type_mask = +mi.BSDFFlags.DiffuseReflection
+    other.component = 1
+    wo, u = [0.0, -0.6, 0.8], (0.01, [0.4, 0.6])
+
+    def numbers(bsdf, ctx, si):
+        values = [bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo), *bsdf.eval_pdf(ctx, si, wo)]
+        value, pdf, drawn, weight = bsdf.eval_pdf_sample(ctx, si, wo, *u)
+        for bs, w in (bsdf.sample(ctx, si, *u), (drawn, weight)):
+            values += [bs.pdf, w]
+        return [np.array(x).max() for x in (*values, value, pdf)]
+
+    for kind in ("nma", "layered"):
+        bsdf = mi.load_dict({"type": kind, **words[0]})
+        front = numbers(bsdf, mi.BSDFContext(), interaction(0.7))
+        assert min(front) > 0, (kind, front)
+        for ctx, cosine in ((rest, 0.7), (other, 0.7), (mi.BSDFContext(), -0.7)):
+            assert not any(numbers(bsdf, ctx, interaction(cosine))), (kind, ctx, cosine)
+        """,
+        "scalar_rgb",
+        MATERIAL,
+    )
+
+
+def test_estimates_at_different_points_are_independent():
+    """`layered` derives the random numbers of `eval` from each number of the point, of its uv and of the directions."""
+    finished(
+        """
+    bsdf = mi.load_dict({"type": "layered", **words[0]})
+    points = [interaction(0.7) for _ in range(6)]
+    for k, si in enumerate(points):
+        numbers = 1.0 * (np.arange(5) == k - 1)
+        si.p, si.uv = numbers[:3], numbers[3:]
+    values = [np.array(bsdf.eval(mi.BSDFContext(), si, [0.0, -0.6, 0.8])).tolist() for si in points * 2]
+    assert values[:6] == values[6:]
+    assert len(set(map(tuple, values))) == 6, values
+        """,
+        "scalar_rgb",
+        MATERIAL,
+    )
+
+
 PLATE = """ply
 format ascii 1.0
 element vertex 3
