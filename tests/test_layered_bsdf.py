@@ -81,6 +81,16 @@ def test_the_methods_of_the_bsdf_agree():
     assert mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection)
 
 
+def test_estimates_at_different_points_are_independent():
+    """`eval` derives its random numbers from each number of the point and of its uv, too."""
+    bsdf, si = mi.load_dict(LACQUER), dr.zeros(mi.SurfaceInteraction3f, 6)
+    si.wi = mi.Vector3f(0.6, 0.0, 0.8)
+    numbers = [mi.Float(dr.arange(mi.UInt32, 6) == k) for k in range(1, 6)]
+    si.p, si.uv = mi.Point3f(*numbers[:3]), mi.Point2f(*numbers[3:])
+    value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0.0, -0.6, 0.8)))
+    assert len(np.unique(value[0])) == 6
+
+
 def test_evaluation_and_sampling_have_the_same_albedo():
     bsdf, ctx, n = mi.load_dict(LACQUER), mi.BSDFContext(), 1 << 17
     for cos_theta in (0.95, 0.4):

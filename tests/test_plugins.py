@@ -121,7 +121,30 @@ def check_albedo(bsdf):
         np.testing.assert_allclose(reported, mean, atol=0.06)
 
 
-CHECKS = (check_values, check_densities, check_albedo)
+def check_black(bsdf):
+    """All methods return 0 for the back, inactive lanes, and contexts without glossy reflection or component 0."""
+    rest, other, every = mi.BSDFContext(), mi.BSDFContext(), mi.BSDFContext()
+    rest.type_mask = +mi.BSDFFlags.DiffuseReflection
+    other.component = 1
+    front, back = interactions(100), interactions(100)
+    back.wi.z = -back.wi.z
+    wo, u = mi.Vector3f(0.0, 0.6, 0.8), (mi.Float(0.3), mi.Point2f(0.4, 0.6))
+    for ctx, si, active in (
+        (rest, front, True),
+        (other, front, True),
+        (every, back, True),
+        (every, front, False),
+    ):
+        value, pdf, drawn, weight = bsdf.eval_pdf_sample(ctx, si, wo, *u, active)
+        found = [value, pdf, drawn.pdf, weight, bsdf.eval(ctx, si, wo, active), bsdf.pdf(ctx, si, wo, active)]
+        drawn, weight = bsdf.sample(ctx, si, *u, active)
+        found += [*bsdf.eval_pdf(ctx, si, wo, active), drawn.pdf, weight]
+        assert not any(np.array(numbers).any() for numbers in found), (
+            f"not black: {ctx}, {si.wi.z[0]}, {active}"
+        )
+
+
+CHECKS = (check_values, check_densities, check_albedo, check_black)
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -135,8 +158,11 @@ def test_a_plugin_without_an_example_is_named():
         load("new")
 
 
-def diffuse(value=1.0, density=1.0, weight=1.0, albedo=0.5):
-    """A diffuse BSDF of albedo .5, whose values, densities, weights and reported albedo are multiplied by factors."""
+def diffuse(value=1.0, density=1.0, weight=1.0, albedo=0.5, ignores=()):
+    """A diffuse BSDF of albedo .5, whose values, densities, weights and reported albedo are multiplied by factors.
+
+    The methods in `ignores`, "eval_pdf" or "sample", ignore the context.
+    """
 
     class Diffuse(define_base()):
         def __init__(self, props):
@@ -144,10 +170,12 @@ def diffuse(value=1.0, density=1.0, weight=1.0, albedo=0.5):
             self._declare()
 
         def eval_pdf(self, ctx, si, wo, active=True):
+            ctx = mi.BSDFContext() if "eval_pdf" in ignores else ctx
             shape = dr.select(self._front(ctx, si, active) & (wo.z > 0), wo.z / np.pi, 0.0)
             return mi.Color3f(0.5 * value * shape), density * shape
 
         def sample(self, ctx, si, sample1, sample2, active=True):
+            ctx = mi.BSDFContext() if "sample" in ignores else ctx
             wo = mi.warp.square_to_cosine_hemisphere(sample2)
             found = mi.Color3f(0.5 * weight) + dr.zeros(mi.Float, dr.width(wo))
             return self._sampled(
@@ -176,6 +204,8 @@ def test_a_diffuse_bsdf_passes_all_checks():
         (check_albedo, {"albedo": -1.0}),
         (check_albedo, {"weight": 1.2}),
         (check_albedo, {"value": 2.2, "weight": 2.2, "albedo": 1.0}),
+        (check_black, {"ignores": ("eval_pdf",)}),
+        (check_black, {"ignores": ("sample",)}),
     ],
     ids=lambda what: getattr(what, "__name__", None) or str(what),
 )
