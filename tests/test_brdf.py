@@ -222,3 +222,27 @@ def test_a_cosine_in_place_of_the_direction_is_refused():
     for cosine in (0.5, np.array([0.5, 0.6]), mi.Float(0.5)):
         with pytest.raises(ParamError, match="not a cosine; nma.ops.at_azimuth_0"):
             adapter.prepare(columns, cosine)
+
+
+def test_arguments_that_do_not_fit_are_refused():
+    """`prepare` refuses a wrong number of columns in every array package, and NumPy arrays of other shapes."""
+    adapter = Adapter.load("layered3-3x32")
+    columns = list(LAYERED3.sample(np.random.default_rng(0), 4).T)
+    up = Vec3(*np.repeat([[0.0], [0.0], [1.0]], 4, axis=1))
+    for wrong in ([*columns, columns[0]], columns[:5], []):
+        for convert in (np.asarray, mi.Float):
+            with pytest.raises(ParamError, match=f"layered3 has 13 columns of parameters, got {len(wrong)}"):
+                adapter.prepare([convert(c) for c in wrong], Vec3(*map(convert, up)))
+    square = Vec3(*(x.reshape(2, 2) for x in up))
+    for wrong, wi in (
+        ([c.reshape(2, 2) for c in columns], square),
+        (columns, square),
+        ([c[:3] for c in columns], up),
+    ):
+        with pytest.raises(ParamError, match=r"have the shapes .*; give arrays \(n,\) of one length n"):
+            adapter.prepare(wrong, wi)
+    for params, cosines in ((columns, 0.5), (np.ones((2, 2, 13)), [0.5]), (np.ones(13), [[0.5]])):
+        with pytest.raises(ParamError, match=r"needs parameters \(m, 13\) and cosines \(n,\)"):
+            adapter.numbers(params, cosines)
+    alone = adapter.prepare([0.2] * 13, Vec3(0.0, 0.0, 1.0))
+    assert np.isfinite(alone.eval(Vec3(0.0, 0.0, 1.0), Vec3(0.0, 0.6, 0.8)).x)

@@ -21,6 +21,48 @@ def test_paths_are_printed_as_they_are(nma, tmp_path):
     assert f"{path}: 1 material(s), 1,600 walks each\n" in err
 
 
+def test_faulty_parameters_are_refused_in_one_line(nma, tmp_path):
+    path, params = tmp_path / "x.npz", np.zeros((1, 13))
+    for arrays, message in (
+        ({"params": params[:0]}, "the array `params` of shape (0, 13) has no materials; add a row"),
+        ({"params": params, "class": "x" * 100_000}, "x...; this version simulates layered3"),
+        ({"params": params, "class": "\x1b[31mred"}, "its materials are of class '\\x1b[31mred'"),
+    ):
+        np.savez(path, **arrays)
+        code, _, told = nma("simulate", "--params", path, "-o", tmp_path / "y.npz")
+        assert code == 1 and message in told and told.count("\n") == 1 and len(told) < 700, told
+
+
+def test_tables_that_cannot_be_fitted_are_refused_before_the_training(nma, tmp_path):
+    """`nma fit` and `nma principled` refuse tables without bins or materials, and parameters out of range.
+
+    The weights file records the parameters, and a file with parameters out of range could not be loaded.
+    """
+    path, params = tmp_path / "x.npz", np.tile(LAYERED3.sample(np.random.default_rng(0), 1), (2, 1))
+    bad = params.copy()
+    bad[1, 0] = 7.0
+    values, walks = np.ones((2, *table.ISOTROPIC.shape)), np.array([1000])
+    for arrays, message in (
+        (
+            {"params": params, "table": values[:, :0]},
+            "x.npz: the table of shape (2, 0, 40, 40, 3) has no bins",
+        ),
+        (
+            {"params": params[:0], "table": values[:0]},
+            "x.npz: the table of shape (0, 40, 40, 40, 3) has no materials",
+        ),
+        ({"params": bad, "table": values}, "x.npz: material 1: alpha_top is 7, allowed is 0.0001 .. 1"),
+        (
+            {"params": params, "table": values, "class": "x" * 100_000},
+            "x..., but this version has only",
+        ),
+    ):
+        np.savez(path, walks=walks, **{"class": "layered3", **arrays})
+        for command in ("fit", "principled"):
+            code, _, told = nma(command, path, "--material", 1, "-o", tmp_path / "y.safetensors")
+            assert code == 1 and message in told and told.count("\n") == 1 and len(told) < 700, told
+
+
 def test_a_disk_that_fills_up_during_the_work_ends_in_one_line(nma, tmp_path, monkeypatch):
     save = np.savez_compressed
 

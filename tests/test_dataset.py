@@ -276,7 +276,29 @@ def test_what_is_no_dataset_is_refused(tmp_path):
     [
         ("nma_dataset", None, "is not a dataset of tables"),
         ("nma_dataset", {**SETTINGS.__dict__, "format": 99}, "has format 99"),
-        ("nma_dataset", {**SETTINGS.__dict__, "colour": 1}, "is not a dataset of tables"),
+        # A later format may have more fields. The data may be good, so nothing advises to delete the data.
+        (
+            "nma_dataset",
+            {**SETTINGS.__dict__, "format": 2, "colour": 1},
+            "has format 2, .* use the version that made",
+        ),
+        (
+            "nma_dataset",
+            {**SETTINGS.__dict__, "colour": 1},
+            "do not fit .*colour.*; use the version that made",
+        ),
+        (
+            "nma_dataset",
+            {**SETTINGS.__dict__, "materials": 24.0},
+            "setting materials is a whole number; got 24.0",
+        ),
+        ("nma_dataset", {**SETTINGS.__dict__, "seed": 0.0}, "setting seed is a whole number; got 0.0"),
+        ("nma_dataset", {**SETTINGS.__dict__, "walks": True}, "setting walks is a whole number; got True"),
+        (
+            "nma_dataset",
+            {**SETTINGS.__dict__, "class_name": "\x1b[31m" + "x" * 100_000},
+            r"^[ -~]{1,600}; this version simulates [ -~]{1,100}$",
+        ),
         (
             "nma_dataset",
             {**SETTINGS.__dict__, "class_name": "paint"},

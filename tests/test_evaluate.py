@@ -205,7 +205,7 @@ def test_references_that_cannot_be_compared_are_refused():
         adapters.evaluate(adapter, reference(np.zeros((1, 4, 5, 6, 3), np.float32)))
     other = replace(reference(np.zeros((1, *ISOTROPIC.shape), np.float32)), class_name="paint")
     with pytest.raises(
-        TableError, match="are of class paint, but the adapter is for class layered3; .*simulate"
+        TableError, match="are of class 'paint', but the adapter is for class layered3; .*simulate"
     ):
         adapters.evaluate(adapter, other)
     with pytest.raises(TableError, match="no material"):

@@ -16,6 +16,7 @@ from nma.errors import NmaError, ParamError, SourceError, TableError, WeightsErr
 from nma.evaluate import evaluate
 from nma.native.runtime import Runtime
 from nma.params import LAYERED3, LIBRARY
+from nma.sources import catalogue
 from nma.sources.merl import SHAPE, Merl
 from nma.table import ISOTROPIC, Tables, collection
 from nma.target import PRINCIPLED_PARAMS
@@ -238,6 +239,10 @@ def test_a_merl_file_is_a_collection_of_one(tmp_path):
     Merl(planes).save(tmp_path / "grey.binary")
     (member,) = collection.members(tmp_path)
     assert member.name == "grey"
+    # A killed run leaves an unfinished file behind, which is no material.
+    (tmp_path / ".nma-0123456789ab.partial.binary").write_bytes(b"unfinished")
+    assert collection.members(tmp_path) == [member]
+    assert [finding.path for finding in catalogue.check(tmp_path)] == [member.path]
     assert isinstance(member.read(), Merl)
 
 

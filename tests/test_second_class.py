@@ -145,11 +145,11 @@ def test_files_of_tables_name_the_class(bare, nma):
     for command, advice in (
         (
             "simulate --params drawn.npz -o x.npz",
-            "drawn.npz: its materials are of class bare; add --class bare",
+            "drawn.npz: its materials are of class 'bare'; add --class bare",
         ),
         (
             "evaluate layered3-3x32 --reference drawn.npz",
-            "drawn.npz: the tables are of class bare, but layered3-3x32 is for class layered3; choose tables of",
+            "drawn.npz: the tables are of class 'bare', but layered3-3x32 is for class layered3; choose tables of",
         ),
     ):
         code, _, told = nma(*command.split())
@@ -201,7 +201,7 @@ def test_tables_of_an_unknown_class_are_refused_by_name(command, nma, tmp_path, 
 
 def test_training_refuses_data_of_another_class(bare):
     data = Settings("layered3", 1, 1600, 0)
-    with pytest.raises(TableError, match="of class layered3, but the adapter is for class bare"):
+    with pytest.raises(TableError, match="of class 'layered3', but the adapter is for class bare"):
         train_class(sources.space("bare"), for_class(sources.space("bare")), data, {})
 
 

@@ -380,7 +380,7 @@ def test_tables_are_joined_with_their_errors(tables):
 
 
 def test_tables_of_several_classes_are_not_joined(tables):
-    with pytest.raises(TableError, match="tables of the classes layered3, paint cannot be joined"):
+    with pytest.raises(TableError, match="tables of the classes 'layered3', 'paint' cannot be joined"):
         Tables.concatenate([tables, replace(tables, class_name="paint")])
 
 

@@ -18,7 +18,7 @@ import jax
 from training_cases import BRASS, TINY, batch_of, constant_adapter, lambertian, means_of
 
 from nma import network, target
-from nma.errors import NmaError
+from nma.errors import NmaError, ParamError
 from nma.evaluate import tabulate_adapter
 from nma.params import LAYERED3
 from nma.table import Tables
@@ -129,6 +129,13 @@ def test_a_fit_approaches_its_table():
     for key in ("steps", "seconds", "version", "jax", "device", "machine", "date"):
         assert record[key], key
     assert adapter.variant == "blended + omega_i"
+
+
+def test_parameters_that_no_file_may_record_are_refused_before_the_training(tables):
+    params = LAYERED3.sample(np.random.default_rng(0), 1)[0]
+    params[0] = 7.0
+    with pytest.raises(ParamError, match="alpha_top is 7, allowed is"):
+        training.fit_material(LAYERED3, QUICK, params, tables[:1], {})
 
 
 @pytest.mark.slow

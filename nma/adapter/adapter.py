@@ -42,7 +42,9 @@ def shipped() -> tuple[str, ...]:
     """The names of the adapters that come with the package."""
     return tuple(
         sorted(
-            p.name.removesuffix(".safetensors") for p in _SHIPPED.iterdir() if p.name.endswith(".safetensors")
+            p.name.removesuffix(".safetensors")
+            for p in _SHIPPED.iterdir()
+            if p.name.endswith(".safetensors") and not p.name.startswith(".")
         )
     )
 
@@ -184,7 +186,8 @@ class Adapter:
         class's parameter vector.
 
         `wi` is a unit vector of the local frame. Dr.Jit lanes that are not `active` get a meaningless BRDF.
-        Raises `ParamError` for a cosine in place of `wi`.
+        Raises `ParamError` for a cosine in place of `wi`, for a wrong number of columns, and for NumPy arrays of other
+        shapes.
         """
         try:
             wi.z  # noqa: B018
@@ -193,13 +196,33 @@ class Adapter:
                 "prepare takes the view direction wi as an nma.ops.Vec3, not a cosine; "
                 "nma.ops.at_azimuth_0(cos_theta_i) converts a cosine"
             ) from None
+        kind = ops.backend(*columns, wi.z)
+        self._check_columns(columns, wi, kind)
         inputs = encoding.get(self.encoding)(columns, wi if self.directional else None)
-        if ops.backend(*columns, wi.z) == "drjit":
+        if kind == "drjit":
             raw = network.forward_lanes(self.layers, inputs, active)
         else:
             arrays = np.broadcast_arrays(wi.z, *inputs)[1:]
             raw = list(network.forward(self.layers, np.stack(arrays, axis=-1).astype(np.float32)).T)
         return self.decode(raw, wi)
+
+    def _check_columns(self, columns: Sequence[Float], wi: Vec3, kind: str) -> None:
+        """Raises `ParamError` for arguments of `prepare` that do not fit together. `kind` is the array package.
+
+        The network of a single material reads no columns, so the columns may be left out."""
+        if len(columns) != self.space.size and (columns or self.encoding not in encoding.SINGLE):
+            raise ParamError(
+                f"the class {self.space.name} has {self.space.size} columns of parameters, got {len(columns)}; give "
+                "one array (n,) for each column"
+            )
+        if kind != "numpy":
+            return
+        shapes = {np.shape(x) for x in (*columns, *wi)} - {(), (1,)}
+        if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
+            raise ParamError(
+                f"the columns and the components of wi have the shapes {', '.join(map(str, sorted(shapes)))}; give "
+                "arrays (n,) of one length n"
+            )
 
     def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
         """The BRDF for the view direction `wi` from the raw outputs of the network.
@@ -227,11 +250,16 @@ class Adapter:
         """The target's parameters (m, n, size) for m materials (m, columns) and n values of cos(theta_i) (n,).
 
         The method calls `prepare`, and then the function `nma.target.numbers`. Raises `ParamError` for anisotropic
-        adapters.
+        adapters, and for arrays of other shapes.
         """
         self.check_isotropic()
         p = np.atleast_2d(np.asarray(params, np.float64))
         mu = np.asarray(cos_theta_i, np.float64)
+        if p.ndim != 2 or mu.ndim != 1:
+            raise ParamError(
+                f"`numbers` needs parameters (m, {self.space.size}) and cosines (n,), got arrays of the shapes "
+                f"{p.shape} and {mu.shape}"
+            )
         columns = [np.repeat(c, len(mu)) for c in p.T]
         flat = numbers(self.prepare(columns, ops.at_azimuth_0(np.tile(mu, len(p)))).blend, self.target)
         arrays = np.broadcast_arrays(*flat)

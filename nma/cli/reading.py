@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from nma.cli import console
-from nma.errors import ParamError, SourceError, TableError
+from nma.errors import ParamError, SourceError, TableError, shown
 from nma.files import arrays
 
 if TYPE_CHECKING:
@@ -160,11 +160,15 @@ def _reference(path: Path, material: str | None) -> tuple[Tables, dict[str, Any]
     tables = Tables.load(path)
     if tables.class_name not in sources.classes():
         raise TableError(
-            f"{path}: its materials are of class '{tables.class_name}', but this version has only "
+            f"{path}: its materials are of class {shown(tables.class_name)}, but this version has only "
             f"{', '.join(sources.classes())}; use the version that wrote the file"
         )
     number = _number(path, len(tables.values), material)
     chosen = tables[number : number + 1]
+    try:
+        chosen.check_params()
+    except ParamError as e:
+        raise TableError(f"{path}: material {number}: {e}") from None
     record = {
         "data": f"table of {path.name}",
         "material": f"{path.stem} {number}" if len(tables.values) > 1 else path.stem,

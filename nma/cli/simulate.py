@@ -11,7 +11,7 @@ import typer
 
 from nma import files
 from nma.cli import console, options
-from nma.errors import TableError
+from nma.errors import TableError, shown
 
 if TYPE_CHECKING:
     import numpy as np
@@ -106,6 +106,7 @@ def _vectors(space, params, material, draw, population, seed):
     """The parameter vectors to simulate, which the user selects by exactly one of --params, --material and --draw."""
     import numpy as np
 
+    from nma import sources
     from nma.table.grid import class_entry
 
     if (params is not None) + bool(material) + bool(draw) != 1:
@@ -119,7 +120,16 @@ def _vectors(space, params, material, draw, population, seed):
                 f"{params} is not an .npz file with an array `params` of shape (n, {space.size}): {e}"
             ) from None
         if named and named != space.name:
-            raise TableError(f"{params}: its materials are of class {named}; add --class {named}")
+            advice = (
+                f"add --class {named}"
+                if named in sources.names()
+                else f"this version simulates {', '.join(sources.names())}"
+            )
+            raise TableError(f"{params}: its materials are of class {shown(named)}; {advice}")
+        if not vectors.size:
+            raise TableError(
+                f"{params}: the array `params` of shape {vectors.shape} has no materials; add a row"
+            )
         return space.check(vectors)
     if material:
         from nma import materials

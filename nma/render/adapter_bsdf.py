@@ -149,10 +149,11 @@ def load_once(name_or_path: str | Path) -> Adapter:
     the file changes.
 
     Paths are relative to the folders of Mitsuba's file resolver, such as the scene's folder, as for Mitsuba's own
-    plugins."""
+    plugins.
+    """
     import mitsuba
 
-    mi: Any = mitsuba  # Mitsuba's type stubs lack the function `file_resolver`
+    mi: Any = mitsuba  # Mitsuba's type stubs lack `file_resolver`
     name_or_path = str(name_or_path)
     if name_or_path not in shipped() and mi.variant() is not None:
         name_or_path = str(mi.file_resolver().resolve(name_or_path))

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nma.errors import ParamError, SourceError, some
+from nma.errors import ParamError, SourceError, shown, some
 from nma.params import LAYERED3, LIBRARY, MEASURED, ParamSpace
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def space(name: str) -> ParamSpace:
     if name in _SPACES:
         return _SPACES[name]
     if name not in CLASSES:
-        raise ParamError(f"there is no class '{name}'; the classes are {', '.join(classes())}")
+        raise ParamError(f"there is no class {shown(name)}; the classes are {', '.join(classes())}")
     return get(name).space
 
 
@@ -59,7 +59,7 @@ def get(name: str) -> Source:
     """The source that simulates the class `name`. Raises `ParamError` if there is no such class, or if the key `name`
     of `CLASSES` differs from the name of the source's class."""
     if name not in CLASSES:
-        raise ParamError(f"unknown class '{name}'; known classes are {', '.join(CLASSES)}")
+        raise ParamError(f"unknown class {shown(name)}; known classes are {', '.join(CLASSES)}")
     source = _at(CLASSES[name])()
     if source.space.name != name:
         raise ParamError(

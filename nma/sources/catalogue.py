@@ -39,6 +39,7 @@ class Finding:
 
 def check(path: str | Path) -> Iterator[Finding]:
     """Checks one file, or all files of measurements in a folder and its subfolders. Yields a `Finding` for each file.
+    Hidden files and folders are left out.
 
     The check compares the file's size and checksum with those of the original file, if they are known. The check also
     reads the file, to test whether its structure and its values are valid. Raises `SourceError` if there is no file to
@@ -50,7 +51,7 @@ def check(path: str | Path) -> Iterator[Finding]:
     if path.is_file():
         yield _check_file(path)
         return
-    files = sorted(p for p in path.rglob("*") if p.is_file() and _belongs(p))
+    files = sorted(p for p in path.rglob("*") if p.is_file() and not _hidden(p, path) and _belongs(p))
     if not files:
         raise SourceError(f"{path}: holds no file of known measurements ({_ENDINGS})")
     for file in files:
@@ -76,6 +77,12 @@ def _check_file(path: Path) -> Finding:
     if hashlib.sha256(path.read_bytes()).hexdigest() != checksum:
         return Finding(path, label, False, "sound, but not the original file: its SHA-256 differs")
     return Finding(path, label, True, "sound; its SHA-256 is that of the original")
+
+
+def _hidden(path: Path, folder: Path) -> bool:
+    """Whether a file in `folder`, or a subfolder that contains the file, is hidden, such as the unfinished files of a
+    killed run."""
+    return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
 def _belongs(path: Path) -> bool:

@@ -40,13 +40,17 @@ def members(path: str | Path) -> list[Member]:
     """The materials of one file, or of all files in a folder, in the order of the files' names.
 
     Files are chosen by their extension, which must be one that `nma.sources.read` understands. In an NBRDF weights file
-    each network is a material. Subfolders are not searched. Raises `SourceError` if there is no material, or if two
-    materials have the same name.
+    each network is a material. Subfolders are not searched, and hidden files, such as the unfinished files of a killed
+    run, are left out. Raises `SourceError` if there is no material, or if two materials have the same name.
     """
     path = Path(path)
     if not path.exists():
         raise SourceError(f"{path}: no such folder or file; `nma data` says where to get measured materials")
-    files = sorted(f for f in path.iterdir() if f.is_file()) if path.is_dir() else [path]
+    files = (
+        sorted(f for f in path.iterdir() if f.is_file() and not f.name.startswith("."))
+        if path.is_dir()
+        else [path]
+    )
     found = [member for file in files if file.suffix in sources.FORMATS for member in _of_file(file)]
     if not found:
         raise SourceError(

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import zarr
@@ -23,7 +23,7 @@ from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 from zarr.errors import ContainsArrayError
 
 from nma import sources
-from nma.errors import DatasetError
+from nma.errors import DatasetError, shown
 from nma.params import Population
 from nma.table.grid import ISOTROPIC, Tables
 from nma.table.walks import stream_keys, tabulate
@@ -51,6 +51,10 @@ class Settings:
     format: int = FORMAT
 
     def __post_init__(self) -> None:
+        counts = {"materials": self.materials, "walks": self.walks, "seed": self.seed}
+        for name, count in counts.items():
+            if not isinstance(count, int | np.integer) or isinstance(count, bool):
+                raise DatasetError(f"a dataset's setting {name} is a whole number; got {shown(count)}")
         if self.materials < 1 or self.walks < 1 or self.seed < 0:
             raise DatasetError(
                 "a dataset needs at least one material, at least one walk, and a seed of at least 0; "
@@ -61,7 +65,7 @@ class Settings:
             # With "unseen_metals", one call of `ParamSpace.sample` draws many materials, and every third of them has a
             # metal held out for tests. A dataset calls `sample` once per material, so it cannot have the population
             # "unseen_metals".
-            raise DatasetError(f"a dataset's population is one of {known}; got '{self.population}'")
+            raise DatasetError(f"a dataset's population is one of {known}; got {shown(self.population)}")
 
 
 def draw_params(settings: Settings, indices: NDArray[np.integer] | Sequence[int]) -> NDArray[np.float64]:
@@ -129,26 +133,30 @@ class Dataset:
         try:
             # Chunks of zeros are stored, too, because a material counts as simulated if the file of its chunk exists.
             table = zarr.open_array(path, mode="r+", config={"write_empty_chunks": True})
-            settings = Settings(**dict(table.attrs["nma_dataset"]))  # type: ignore[arg-type]
-            fingerprint = table.attrs["nma_params"]
+            stored: dict[str, Any] = dict(table.attrs["nma_dataset"])  # type: ignore[arg-type]
         except Exception as e:
-            advice = f"`nma dataset CLASS {path}` makes one"
-            if os.path.exists(path / "zarr.json"):
-                advice = f"choose another folder; a damaged dataset can be deleted and made again: {advice}"
-            elif _has_other_files(path) or os.path.isfile(path):
-                advice = (
-                    "choose the folder of a dataset; `nma dataset CLASS FOLDER` makes one in a new folder"
-                )
-            reason = str(e).partition("\n")[0] or type(e).__name__
-            raise DatasetError(f"{path} is not a dataset of tables ({reason}); {advice}") from None
-        if settings.format != FORMAT:
+            raise _no_dataset(path, e) from None
+        # A later format may have other fields, so the format is checked before the fields.
+        found = stored.get("format", FORMAT)
+        if type(found) is not int or found != FORMAT:
             raise DatasetError(
-                f"{path} has format {settings.format}, but this version reads format {FORMAT}; make the dataset again"
+                f"{path} has format {shown(found)}, but this version reads format {FORMAT}; use the version that made "
+                "the dataset, or choose another folder"
             )
+        try:
+            settings = Settings(**stored)
+            fingerprint = table.attrs["nma_params"]
+        except TypeError as e:
+            raise DatasetError(
+                f"{path}: the settings of the dataset do not fit this version ({shown(str(e))}); use the version "
+                "that made the dataset, or choose another folder"
+            ) from None
+        except Exception as e:
+            raise _no_dataset(path, e) from None
         if settings.class_name not in sources.names():
             raise DatasetError(
-                f"{path} is of class '{settings.class_name}'; this version simulates {', '.join(sources.names())}: use "
-                "the version that made it"
+                f"{path} is of class {shown(settings.class_name)}; this version simulates "
+                f"{', '.join(sources.names())}: use the version that made it"
             )
         if fingerprint != _fingerprint(settings):
             raise DatasetError(
@@ -234,6 +242,17 @@ def _has_other_files(path: Path) -> bool:
     may be creating a dataset."""
     names = os.listdir(path) if os.path.isdir(path) else []
     return "zarr.json" not in names and not all(name.endswith(".partial") for name in names)
+
+
+def _no_dataset(path: Path, error: Exception) -> DatasetError:
+    """The error for a folder without a dataset that can be read."""
+    advice = f"`nma dataset CLASS {path}` makes one"
+    if os.path.exists(path / "zarr.json"):
+        advice = f"choose another folder; a damaged dataset can be deleted and made again: {advice}"
+    elif _has_other_files(path) or os.path.isfile(path):
+        advice = "choose the folder of a dataset; `nma dataset CLASS FOLDER` makes one in a new folder"
+    reason = str(error).partition("\n")[0] or type(error).__name__
+    return DatasetError(f"{path} is not a dataset of tables ({reason}); {advice}")
 
 
 def _create_array(path: Path, settings: Settings) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import sources
-from nma.errors import OutputError, ParamError, TableError
+from nma.errors import OutputError, ParamError, TableError, shown
 from nma.files import arrays, whole
 from nma.params import ParamSpace
 
@@ -85,6 +85,8 @@ class Tables:
     def __post_init__(self) -> None:
         if not self.class_name:
             self.class_name = _class_with(self.params.shape[-1])
+        if 0 in self.values.shape[1:]:
+            raise TableError(f"the table of shape {self.values.shape} has no bins; choose a larger grid")
 
     @property
     def grid(self) -> Grid:
@@ -110,7 +112,7 @@ class Tables:
         classes = sorted({t.class_name for t in parts})
         if len(classes) > 1:
             raise TableError(
-                f"tables of the classes {', '.join(classes)} cannot be joined; join one class at a time"
+                f"tables of the classes {', '.join(map(shown, classes))} cannot be joined; join one class at a time"
             )
         errors = [t.error for t in parts if t.error is not None]
         if errors and len(errors) < len(parts):
@@ -130,6 +132,10 @@ class Tables:
             return sources.space(self.class_name)
         except ParamError as e:
             raise TableError(f"{e}; use the version that made the tables") from None
+
+    def check_params(self) -> None:
+        """Raises `ParamError` for parameters outside the range that the source of the class accepts."""
+        self.space.check(self.params)
 
     def save(self, path: str | Path) -> None:
         """Writes a reference file, atomically. CONVENTIONS.md describes the file format."""
@@ -179,8 +185,8 @@ def check_class(found: str, wanted: str, reader: str, where: str = "") -> None:
     if found != wanted:
         simulated = f": `nma simulate --class {wanted}`" if wanted in sources.names() else ""
         raise TableError(
-            f"{where}the tables are of class {found}, but {reader} is for class {wanted}; choose tables of class "
-            f"{wanted}{simulated}"
+            f"{where}the tables are of class {shown(found)}, but {reader} is for class {wanted}; choose tables of "
+            f"class {wanted}{simulated}"
         )
 
 
@@ -249,6 +255,11 @@ def _check_arrays(
         raise TableError(
             f"{path}: params {params.shape} and table {values.shape} are not (n, columns) and "
             "(n, theta_i[, phi_i], theta_o, phi, 3)"
+        )
+    if not n or not values.size:
+        what = "bins" if n else "materials"
+        raise TableError(
+            f"{path}: the table of shape {values.shape} has no {what}; simulate the materials again"
         )
     if error is not None and error.shape != values.shape:
         raise TableError(f"{path}: error has shape {error.shape}, but table has shape {values.shape}")

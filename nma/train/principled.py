@@ -107,7 +107,8 @@ def fit_constant(
     """Fits the isotropic table of one material from several starting points, and returns the fit with the lowest score.
 
     `record` says where the table comes from and is stored with the adapter. Equal arguments give equal results on the
-    same machine. Raises `TableError` if the table has several materials or another grid.
+    same machine. Raises `TableError` if the table has several materials or another grid, and `ParamError` for
+    parameters that the class does not allow.
     """
     if len(tables.values) != 1:
         raise TableError(
@@ -118,6 +119,7 @@ def fit_constant(
             f"constant parameters are fitted to isotropic tables of shape {ISOTROPIC.shape}, "
             f"but this table has the shape {tables.values.shape[1:]}"
         )
+    tables.check_params()  # the weights file records the parameters
     pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
     run = loop.start(recipe, _starts(tables))
     loop.train(

@@ -99,7 +99,11 @@ def fit_material(
     progress: Callable[[loop.Run], None] = lambda run: None,
     budget_seconds: float = float("inf"),
 ) -> tuple[Adapter, loop.Run]:
-    """Trains an adapter on the table of one material only (paper Fig. 4, left)."""
+    """Trains an adapter on the table of one material only (paper Fig. 4, left).
+
+    Raises `ParamError` for parameters that the class does not allow, because the weights file records them.
+    """
+    space.check(params)
     record = {**record, "params": np.asarray(params).ravel().tolist()}
     return train_class(space, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
 
