@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from adapter_cases import random_adapter
-from runtime_cases import pointer, rows
+from runtime_cases import facing, pointer, rows
 from target_cases import random_directions, stacked
 
 from nma import Runtime
@@ -68,6 +68,20 @@ def test_stretched_brdfs_have_the_values_of_the_package_at_every_azimuth(stretch
     expected = stacked(adapter.prepare([], view).eval(view, light)).T
     found = runtime.eval(prepared(runtime, way, wi), wi, wo)
     assert np.abs(found - expected).mean() < WITHIN[way] * expected.mean()
+
+
+def test_only_a_c_brdf_prepared_at_azimuth_0_turns_with_the_view(stretched, directions):
+    """A C++ BRDF computes the plane of incidence in each call. A Python BRDF keeps the plane of `prepare`."""
+    adapter, runtime = stretched
+    wi, wo, _ = directions
+    unturned = facing(wi[:, 2].astype(np.float64))
+    brdfs = runtime.prepare(np.zeros((CASES, 0), np.float32), unturned)
+    np.testing.assert_allclose(
+        runtime.eval(brdfs, wi, wo), runtime.eval(prepared(runtime, "batch", wi), wi, wo)
+    )
+    view, other, light = (Vec3(*v.astype(np.float64).T) for v in (wi, unturned, wo))
+    kept, turned = (stacked(adapter.prepare([], v).eval(view, light)) for v in (other, view))
+    assert np.abs(kept - turned).mean() > 0.1 * turned.mean()
 
 
 @pytest.mark.parametrize("way", WITHIN)

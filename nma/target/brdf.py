@@ -15,7 +15,8 @@ class Brdf(NamedTuple):
 
     `plane` is the plane of incidence if lobes stretch along this plane. For other blends, `plane` is None, and the
     blend's frame is the local frame. Directions are unit vectors of the local frame. The methods need the `wi` for
-    which the BRDF was prepared.
+    which the BRDF was prepared. A Python `Brdf` keeps the plane of this `wi`, but a C++ `Brdf` computes the plane from
+    the `wi` of each call.
     """
 
     blend: Blend

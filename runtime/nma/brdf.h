@@ -58,7 +58,8 @@ private:
 
     // The frame in which the blend is evaluated. If the lobes were trained in the plane of incidence, the axes of their
     // anisotropy are in that plane and perpendicular to it. Each call computes the plane from `wi`, because a BRDF that
-    // was prepared for a cosine is used for all azimuths.
+    // was prepared for a cosine is used for all azimuths. A Python `Brdf` keeps the plane of the `wi` that `prepare`
+    // was called with.
     Plane<float> frame(const Direction& wi) const { return in_plane_ ? plane_of<float>(wi) : Plane<float>{1.0f, 0.0f}; }
 
     Blend<float> blend_;
