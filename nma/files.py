@@ -30,9 +30,10 @@ _CLEANERS: list[Callable[[], None]] = []
 
 @contextmanager
 def cleaning(cleaner: Callable[[], None]) -> Iterator[None]:
-    """A context manager: while the `with` block runs, `clean_up` calls `cleaner`, which deletes temporary files.
+    """A context manager: while the `with` block runs, `clean_up` calls `cleaner`.
 
-    `cleaner` is not called at the end of the block.
+    `cleaner` deletes temporary files, ends a process that writes them, or waits until a file is complete. `cleaner` is
+    not called at the end of the block.
     """
     _CLEANERS.append(cleaner)
     try:

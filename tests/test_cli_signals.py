@@ -150,3 +150,26 @@ names = build.shared_library
     assert process.returncode == -signal.SIGTERM
     assert not list((tmp_path / "cache").glob("*/*"))
     assert (tmp_path / "ended").exists()
+
+
+@pytest.mark.parametrize("part", ["zarr.json", "c"])
+def test_a_signal_waits_until_a_file_of_a_dataset_is_complete(tmp_path, part):
+    """A thread of zarr writes the description of a dataset, and each of its chunks, by way of a temporary file."""
+    body = f"""
+from pathlib import Path
+import numpy as np
+from nma.table import dataset, ISOTROPIC
+replace = Path.replace
+def slowly(self, target):
+    if {part!r} in Path(target).parts:
+        print("writing", flush=True)
+        time.sleep(0.4)
+    return replace(self, target)
+Path.replace = slowly
+def names():
+    data = dataset.Dataset.create("x.zarr", dataset.Settings("layered3", 2, 1, 0))
+    data._store([0, 1], np.zeros((2, *ISOTROPIC.shape), np.float16))
+"""
+    assert ended(start(tmp_path, body), signal.SIGTERM)[0] == -signal.SIGTERM
+    left = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == ({"zarr.json"} if part == "zarr.json" else {"zarr.json", "0"})

@@ -149,6 +149,14 @@ def test_a_writer_that_fails_leaves_no_chunk(tmp_path, monkeypatch):
     assert data.missing().tolist() == [0]
 
 
+def test_black_materials_are_stored(tmp_path):
+    """zarr stores no chunk of zeros unless told to, and a material without a chunk counts as missing."""
+    data = Dataset.create(tmp_path / "x.zarr", Settings("layered3", 2, 1, 0))
+    data._store([0, 1], np.zeros((2, *ISOTROPIC.shape), np.float16))
+    assert not len(data.missing())
+    assert not data.load().values.any()
+
+
 def test_progress_counts_what_others_did(copy):
     for index in (1, 2, 23):
         os.remove(copy._chunk(index))

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -24,6 +25,7 @@ from zarr.errors import ContainsArrayError
 
 from nma import sources
 from nma.errors import DatasetError, shown
+from nma.files import cleaning
 from nma.params import Population
 from nma.table.grid import ISOTROPIC, Tables
 from nma.table.walks import stream_keys, tabulate
@@ -132,7 +134,9 @@ class Dataset:
         path = Path(path)
         try:
             # Chunks of zeros are stored, too, because a material counts as simulated if the file of its chunk exists.
-            table = zarr.open_array(path, mode="r+", config={"write_empty_chunks": True})
+            # zarr 3.1.6 ignores the argument `config` of `open_array` for an array that exists.
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                table = zarr.open_array(path, mode="r+")
             stored: dict[str, Any] = dict(table.attrs["nma_dataset"])  # type: ignore[arg-type]
         except Exception as e:
             raise _no_dataset(path, e) from None
@@ -193,7 +197,8 @@ class Dataset:
     def _store(self, indices: Sequence[int], values: NDArray[np.float16]) -> None:
         try:
             for i, value in zip(indices, values, strict=True):
-                self._table[i] = value
+                with _writing(self._chunk(i)):
+                    self._table[i] = value
         except OSError as e:
             raise DatasetError(
                 f"{self.path}: cannot write ({e}); run the same command again to continue"
@@ -258,7 +263,7 @@ def _no_dataset(path: Path, error: Exception) -> DatasetError:
 def _create_array(path: Path, settings: Settings) -> None:
     """Creates an empty dataset at `path`, unless another worker has just created it."""
     try:
-        with suppress(ContainsArrayError):
+        with suppress(ContainsArrayError), _writing(path / "zarr.json"):
             zarr.create_array(
                 store=path,
                 shape=(settings.materials, *ISOTROPIC.shape),
@@ -270,3 +275,20 @@ def _create_array(path: Path, settings: Settings) -> None:
             )
     except OSError as e:
         raise DatasetError(f"{path}: cannot create a dataset there ({e})") from None
+
+
+@contextmanager
+def _writing(file: str | Path) -> Iterator[None]:
+    """A context manager for a `with` block in which a thread of zarr writes `file` by way of a temporary file.
+
+    If a signal ends the process meanwhile, the process waits for at most one second until `file` exists, so that no
+    temporary file remains.
+    """
+
+    def wait() -> None:
+        latest = time.monotonic() + 1.0
+        while not os.path.exists(file) and time.monotonic() < latest:
+            time.sleep(0.01)
+
+    with cleaning(wait):
+        yield
