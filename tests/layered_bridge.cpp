@@ -111,6 +111,12 @@ void layered_out_through_coat(int n, const float* parameters, const float* wo, c
             layered::detail::out_through_coat(stack, vec(wo + 3 * i), vec(up + 3 * i));
 }
 
+// Writes the values of the coat's reflection for n pairs of directions, the rows of `wi` and `wo`.
+void layered_coat_reflection(int n, const float* parameters, const float* wi, const float* wo, float* out) {
+    const auto stack = layered::Stack::of(parameters);
+    for (int i = 0; i < n; ++i) out[i] = layered::coat_reflection(stack, vec(wi + 3 * i), vec(wo + 3 * i));
+}
+
 void layered_albedo(const float* parameters, const float* wi, float* out) {
     put(layered::albedo(layered::Stack::of(parameters), vec(wi)), out);
 }

@@ -282,6 +282,24 @@ def test_tables_are_cached_until_their_file_changes(folder, tmp_path, monkeypatc
     assert len(made) == 5
 
 
+def test_materials_of_one_file_have_tables_of_their_own(tmp_path, monkeypatch):
+    made = []
+
+    def table(member):
+        made.append(member.material)
+        return Tables(
+            np.zeros((1, 0)), np.full((1, 2, 2, 2, 3), float(len(made))), np.array([1]), None, "measured"
+        )
+
+    monkeypatch.setattr(collection, "_table", table)
+    (tmp_path / "two.npz").write_bytes(b"two materials")
+    members = [collection.Member(name, tmp_path / "two.npz", name) for name in ("first", "second")]
+    for _ in range(2):
+        found = collection.tables(members, tmp_path / "tables")
+        assert found.values[:, 0, 0, 0, 0].tolist() == [1.0, 2.0]
+    assert made == ["first", "second"]
+
+
 @pytest.mark.slow
 def test_the_commands_train_list_encode_and_extract(nma, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "RECIPE", TINY)

@@ -183,6 +183,18 @@ def bent_more(params):
     return np.where(np.arange(len(params)) == 2, 1.02 * params, params)
 
 
+def test_the_coat_s_reflection_is_that_of_the_package_and_reciprocal(bridge):
+    """f cos(theta_i) cos(theta_o) is the same if wi and wo are exchanged, also near the horizon."""
+    rng, n, about = np.random.default_rng(7), 1000, vector(CASES["strong_coat"])
+    wi, wo = random_views(rng, n), random_views(rng, n)
+    wi[: n // 2] = facing(10.0 ** rng.uniform(-6, -3, n // 2))
+    wi, wo = wi.astype(np.float32), wo.astype(np.float32)
+    found, back = (bridge("layered_coat_reflection", (about, *pair), (n,)) for pair in ((wi, wo), (wo, wi)))
+    expected = layered_eval.coat_reflection(layers_of(CASES["strong_coat"]), vec3(wi), vec3(wo))
+    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-4)
+    np.testing.assert_allclose(found * wi[:, 2], back * wo[:, 2], rtol=1e-3)
+
+
 @pytest.mark.parametrize("case", ["index_matched", "strong_coat"])
 def test_light_that_grazes_the_coat_from_inside_leaves_as_in_the_package(bridge, case):
     """C++ and the package compute the same light that leaves the coat, also if the light inside is almost horizontal.
