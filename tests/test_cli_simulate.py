@@ -112,7 +112,7 @@ def test_only_a_part_of_the_same_simulation_is_used_again(nma, tmp_path, monkeyp
         return Tables(params, np.zeros((1, 2, 2, 2, 3)), np.array([walks]), None, source.space.name)
 
     monkeypatch.setattr(sources, "get", lambda name: Other() if name == "other" else Layered3())
-    monkeypatch.setattr(shutil, "rmtree", lambda *arguments, **options: None)
+    monkeypatch.setattr("nma.cli.simulate._remove", lambda parts: None)
     monkeypatch.setattr(table, "tabulate", blank)
     files = [tmp_path / f"{k}.npz" for k in range(2)]
     for k, path in enumerate(files):
