@@ -136,20 +136,22 @@ def test_stretching_fades_towards_normal_incidence():
 
 
 @pytest.mark.parametrize(
-    "entry",
+    ("entry", "message"),
     (
-        {"name": "transmission"},
-        {"name": "roughness", "low": 0.5, "high": 0.1},
-        {"name": "roughness", "low": 0.0, "scale": "log"},
-        {"name": "roughness", "scale": "cubic"},
-        {"name": "base_color", "size": 1},
-        {"name": "roughness", "colour": 1},
-        {"name": "roughness", "in_plane": True},
+        ({"name": "transmission"}, "wrong name or size"),
+        ({"name": "roughness", "low": 0.5, "high": 0.1}, "no valid range"),
+        ({"name": "roughness", "low": 0.0, "scale": "log"}, "no valid range"),
+        ({"name": "roughness", "scale": "cubic"}, "no valid range"),
+        ({"name": "base_color", "size": 1}, "wrong name or size"),
+        ({"name": "roughness", "colour": 1}, "colour"),
+        ({"name": "roughness", "in_plane": True}, "cannot be `in_plane`"),
+        ({"name": "roughness"}, "must have a base_color"),
     ),
 )
-def test_senseless_declarations_are_refused(entry):
-    with pytest.raises(WeightsError):
-        params_from_json([entry])
+def test_senseless_declarations_are_refused(entry, message):
+    complete = params_to_json([TargetParam("roughness")])[0]
+    with pytest.raises(WeightsError, match=message):
+        params_from_json([complete | entry])
 
 
 @pytest.mark.parametrize(
@@ -157,11 +159,12 @@ def test_senseless_declarations_are_refused(entry):
     [("specular", 0.0, 12.0), ("anisotropic", -1e6, 1.0), ("fade", -1.0, 1.0), ("fade_width", 0.0, 1e6)],
 )
 def test_ranges_end_where_the_field_is_defined(name, low, high):
-    colour = {"name": "base_color", "size": 3}
-    assert params_from_json([colour, {"name": name, "low": low, "high": high}])
-    for wider in ({"low": low - 0.01, "high": high}, {"low": low, "high": high + 0.01}):
+    colour = TargetParam("base_color", size=3)
+    widest = (colour, TargetParam(name, low=low, high=high))
+    assert params_from_json(params_to_json(widest)) == widest
+    for wider in (TargetParam(name, low=low - 0.01, high=high), TargetParam(name, low=low, high=high + 0.01)):
         with pytest.raises(WeightsError, match="no valid range"):
-            params_from_json([colour, {"name": name, **wider}])
+            params_from_json(params_to_json([colour, wider]))
 
 
 def test_jax_decodes_to_the_same_numbers_as_numpy():
