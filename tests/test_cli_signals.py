@@ -15,6 +15,8 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 # The command `nma materials`, in which the function `names` of a test replaces the function that lists the materials.
 COMMAND = """
 import gc, os, signal, sys, time
+for number in {defaults}:
+    signal.signal(number, signal.SIG_DFL)
 from nma import cli, files, materials
 {body}
 materials.names = names
@@ -33,9 +35,14 @@ def names():
 
 
 def start(folder, body, *before):
-    """Starts a command in `folder`, which also becomes the folder of temporary files."""
+    """Starts a command in `folder`, which also becomes the folder of temporary files.
+
+    A program that starts the tests in the background may ignore signals, and processes inherit this. Without a command
+    `before`, such as `nohup`, the started command therefore sets the signals to their defaults.
+    """
+    defaults = [] if before else [int(number) for number in SIGNALS]
     return subprocess.Popen(
-        [*before, sys.executable, "-c", COMMAND.format(body=body)],
+        [*before, sys.executable, "-c", COMMAND.format(body=body, defaults=defaults)],
         cwd=folder,
         env=os.environ | {"TMPDIR": str(folder)},
         stdin=subprocess.DEVNULL,
