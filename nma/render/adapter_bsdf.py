@@ -23,6 +23,7 @@ from nma.ops import Color, Vec3, select
 from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.render.curves import MIN_COS, Curves
 from nma.render.inputs import of_adapter
+from nma.render.paths import scene_path
 from nma.target import Brdf, numbers
 
 DEFAULT_ADAPTER = "layered3-5x64"
@@ -148,15 +149,13 @@ def load_once(name_or_path: str | Path) -> Adapter:
     """Loads an adapter by its name or from a weights file. BSDFs that name the same file share one `Adapter`, unless
     the file changes.
 
-    Paths are relative to the folders of Mitsuba's file resolver, such as the scene's folder, as for Mitsuba's own
-    plugins.
+    Paths are those of `scene_path`, once a variant of Mitsuba is set.
     """
-    import mitsuba
+    import mitsuba as mi
 
-    mi: Any = mitsuba  # Mitsuba's type stubs lack `file_resolver`
     name_or_path = str(name_or_path)
     if name_or_path not in shipped() and mi.variant() is not None:
-        name_or_path = str(mi.file_resolver().resolve(name_or_path))
+        name_or_path = scene_path(name_or_path)
     path = weights_file(name_or_path)
     stat = Path(path).stat() if Path(path).is_file() else None
     return _loaded(name_or_path, (stat.st_mtime_ns, stat.st_size) if stat else None)

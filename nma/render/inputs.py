@@ -13,6 +13,7 @@ from nma.errors import ParamError, TextureError, either
 from nma.images.io import COLOUR
 from nma.params import MEASURED, Param, ParamSpace, Range
 from nma.render.input_checks import Allowed, check_numbers, check_texture
+from nma.render.paths import scene_path
 from nma.render.textures import bitmap_texture
 
 
@@ -318,10 +319,7 @@ def _material_values(name: str, space: ParamSpace) -> dict[str, Any]:
     import mitsuba
 
     mi: Any = mitsuba  # Mitsuba's types change with the variant
-
-    # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
-    found = mi.file_resolver().resolve(name) if name.endswith(".toml") else name
-    material = materials.load(str(found))
+    material = materials.load(scene_path(name) if name.endswith(".toml") else name)
     if material.class_name != space.name:
         raise ParamError(
             f"material '{name}' is of class {material.class_name}, but this BSDF needs class {space.name}; "

@@ -16,6 +16,7 @@ from typing import Any
 from nma import sources, target
 from nma.ops import Color, select
 from nma.render.bsdf import define_base, mean_of_samples, over, vec3
+from nma.render.paths import scene_path
 from nma.sources.base import Values
 from nma.target import Blend, Principled
 
@@ -60,8 +61,7 @@ def define() -> type:
 
         @staticmethod
         def _read(props: mi.Properties) -> Values:
-            # Paths are relative to the scene's folder, as for Mitsuba's own plugins.
-            path = str(mi.file_resolver().resolve(str(props["file"])))
+            path = scene_path(str(props["file"]))
             return sources.read(path, str(props["material"]) if "material" in props else None)
 
         def to_string(self) -> str:
