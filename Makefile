@@ -1,6 +1,7 @@
 # make demo      render one picture with the reference and the adapter: out/demo.png
 # make test      lint and fast tests; takes minutes
-# make test-all  lint, types and all tests, with quick runs of the experiments and benches; what .ci/run runs
+# make test-all  lint, types, fast tests and slow tests
+# make test-runs quick runs of experiments and benches; .ci/run runs test-all, then test-runs
 # make lint      ruff, import contracts and clang-format
 # make figures   list the experiments; run them with make figures ARGS=all, or ARGS="shipped --quick"
 # make types     run the type checker
@@ -11,7 +12,7 @@ BIN := .venv/bin
 WORKERS ?= 2
 PYTEST = $(BIN)/python -m pytest --quiet --numprocesses $(WORKERS) --dist worksteal
 
-.PHONY: demo test test-all lint figures types wheel lock
+.PHONY: demo test test-all test-runs lint figures types wheel lock
 demo:
 	@tools/setup.sh demo
 	$(BIN)/nma demo
@@ -19,9 +20,12 @@ demo:
 test: lint
 	$(PYTEST) $(ARGS)
 
-# All tests run in one pytest process, so that its summary comes last.
 test-all: lint types
-	$(PYTEST) -m "slow or not slow" $(ARGS)
+	$(PYTEST) -m "not runs" $(ARGS)
+
+test-runs:
+	@tools/setup.sh test
+	$(PYTEST) -m runs $(ARGS)
 
 lint:
 	@tools/setup.sh test

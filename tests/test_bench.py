@@ -174,7 +174,7 @@ def test_the_command_without_a_name_lists_all_benches():
     assert "no bench no-such-bench" in unknown.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.runs
 @pytest.mark.parametrize("name", PICTURED + ["reciprocity"])
 def test_every_bench_runs_in_its_quick_form(name, tmp_path):
     run = bench(name, "--quick", "--output", tmp_path)

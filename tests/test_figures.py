@@ -26,7 +26,7 @@ def figures(*words):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.runs
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_runs_in_its_quick_form(name, request):
     if name in NEED_DATA:
