@@ -1,4 +1,8 @@
-"""Evaluates the network of an adapter: linear layers with ReLU between them."""
+"""Evaluates the network of an adapter: linear layers with ReLU between them.
+
+The last layer may read the inputs of the network, too, in addition to the neurons of the layer before. Its matrix then
+has further columns, for the inputs.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +37,17 @@ _SUMS = 4
 _BLOCK = 28
 
 
-def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | None = None) -> Layers:
+def init(
+    rng: np.random.Generator,
+    sizes: Sequence[int],
+    output_bias: NDArray | None = None,
+    skip: NDArray | None = None,
+) -> Layers:
     """Random layers of the given `sizes` (inputs, hidden layers, outputs), initialised as in He 2015.
 
     A layer with as many inputs as outputs is initialised near the identity, which makes a deep network as easy to train
     as a shallow network. The last layer has small weights and the bias `output_bias` (outputs,), or the bias 0 if
-    `output_bias` is None.
+    `output_bias` is None. With `skip` (outputs, inputs), the last layer reads the inputs, too, by these weights.
     """
     layers: Layers = []
     for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
@@ -47,16 +56,26 @@ def init(rng: np.random.Generator, sizes: Sequence[int], output_bias: NDArray | 
             matrix = np.eye(fan_in) + _MIXING * matrix
         layers.append((matrix.astype(np.float32), np.zeros(fan_out, np.float32)))
     matrix, bias = layers[-1]
-    layers[-1] = (0.1 * matrix, bias if output_bias is None else np.asarray(output_bias, np.float32))
+    matrix = 0.1 * matrix if skip is None else np.concatenate([0.1 * matrix, skip], axis=1, dtype=np.float32)
+    layers[-1] = (matrix, bias if output_bias is None else np.asarray(output_bias, np.float32))
     return layers
 
 
+def skip_width(layers: Layers) -> int:
+    """The number of the network's inputs that the last layer reads, all or none of them."""
+    return int(layers[-1][0].shape[1] - layers[-2][0].shape[0]) if len(layers) > 1 else 0
+
+
 def forward(layers: Layers, x: Any) -> Any:
-    """The outputs (n, out) of the network for the inputs `x` (n, in), in NumPy or JAX."""
+    """The outputs (n, out) of the network for the inputs `x` (n, in), in NumPy, in JAX, or of Dr.Jit's tensors."""
+    y = x
     for matrix, bias in layers[:-1]:
-        x = ops.maximum(x @ matrix.T + bias, 0.0)
+        y = ops.maximum(y @ matrix.T + bias, 0.0)
     matrix, bias = layers[-1]
-    return x @ matrix.T + bias
+    if not skip_width(layers):
+        return y @ matrix.T + bias
+    own = matrix.shape[1] - skip_width(layers)
+    return y @ matrix[:, :own].T + (x @ matrix[:, own:].T + bias)
 
 
 def forward_lanes(
@@ -90,10 +109,11 @@ def _unrolled(layers: Sequence[tuple[NDArray, NDArray]], x: Sequence[Float]) -> 
         return dr.maximum(total, 0.0)
 
     layer = _in_blocks if _many_registers(x[0]) else _by_neuron
+    inputs = list(x) if skip_width(layers) else []
     for matrix, bias in layers[:-1]:
         x = layer(matrix.tolist(), bias.tolist(), x, relu)
     matrix, bias = layers[-1]
-    return layer(matrix.tolist(), bias.tolist(), x, lambda total: total)
+    return layer(matrix.tolist(), bias.tolist(), [*x, *inputs], lambda total: total)
 
 
 def _by_neuron(

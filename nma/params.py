@@ -104,10 +104,15 @@ class Param:
 
 @dataclass(frozen=True)
 class ParamSpace:
-    """The parameters of a class, in the order of the columns of a parameter vector."""
+    """The parameters of a class, in the order of the columns of a parameter vector.
+
+    If the uppermost layer of the class is the interface of a rough dielectric, `interface` names the two parameters
+    that are its microfacet width and its index of refraction. Targets whose lobes lie under an interface need them.
+    """
 
     name: str
     params: tuple[Param, ...]
+    interface: tuple[str, str] | None = None
 
     @property
     def size(self) -> int:
@@ -119,6 +124,11 @@ class ParamSpace:
         """For each parameter, by name, its columns in a parameter vector."""
         ends = np.cumsum([p.size for p in self.params])
         return {p.name: slice(int(e) - p.size, int(e)) for p, e in zip(self.params, ends, strict=True)}
+
+    @property
+    def interface_columns(self) -> tuple[int, ...]:
+        """The columns of the two parameters of the interface; empty for a class without an interface."""
+        return tuple(self.slices[name].start for name in self.interface or ())
 
     def __getitem__(self, name: str) -> Param:
         for p in self.params:
@@ -264,6 +274,7 @@ LAYERED3 = ParamSpace(
             "optical depth of the medium (thickness 1)",
         ),
     ),
+    interface=("alpha_top", "eta_top"),
 )
 
 # The class of materials that have no parameters, only BRDF values: measured, tabulated, or from another program's BSDF.

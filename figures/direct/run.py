@@ -136,7 +136,7 @@ def of_adapter(adapter: nma.Adapter, params: NDArray) -> Evaluate:
     def at_points(material: jax.Array, wi: Vec3, wo: Vec3) -> jax.Array:
         inputs = [jnp.broadcast_to(x, wi.z.shape) for x in encode(list(material), wi)]
         raw = network.forward(adapter.layers, jnp.stack(inputs, axis=-1))
-        return jnp.stack(adapter.decode(list(raw.T), wi).eval(wi, wo), axis=-1)
+        return jnp.stack(adapter.decode(list(raw.T), wi, list(material)).eval(wi, wo), axis=-1)
 
     run = batched(at_points)
     return lambda number, wi, wo: run(materials[number], wi, wo)

@@ -24,11 +24,13 @@ from nma.target.decode import (
     TargetParam,
     decode,
     from_numbers,
+    needs_interface,
     numbers,
     output_size,
     params_from_json,
     params_to_json,
 )
+from nma.target.interface import Interface
 from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
@@ -62,6 +64,8 @@ class Adapter:
     """A trained network with its encoding and its target. `Adapter.load` reads a file, and `prepare` runs the network.
 
     With `bounded`, the blend is dimmed where it might reflect more light than it receives (`nma.target.bounded`).
+    `interface` names the parameters of the interface under which the target lies (`ParamSpace.interface`), if the
+    target does.
     """
 
     space: ParamSpace
@@ -72,6 +76,7 @@ class Adapter:
     target: tuple[TargetParam, ...]
     training: dict[str, Any] = field(default_factory=dict)
     bounded: bool = False
+    interface: tuple[str, str] | None = None
 
     @staticmethod
     def load(name_or_path: str | Path) -> Adapter:
@@ -96,6 +101,7 @@ class Adapter:
             target,
             header.training,
             header.bounded,
+            tuple(header.interface) or None,  # type: ignore[arg-type]  # `_check` requires two names
         )
         adapter._check(path, header.dialect)
         return adapter
@@ -113,6 +119,8 @@ class Adapter:
             bounded=self.bounded,
             dialect=DIALECT,
             target=params_to_json(self.target),
+            interface=list(self.interface or ()),
+            skip=network.skip_width(self.layers) > 0,
             training=self.training,
         )
         weights.write(path, header, self.layers, more)
@@ -132,7 +140,13 @@ class Adapter:
 
     @property
     def size(self) -> int:
-        """The count of numbers that describe the target: 23 for the paper's blend of two instances."""
+        """The count of numbers that describe the target (`numbers`): 23 for the paper's blend of two instances."""
+        return self.outputs + len(self.interface or ())
+
+    @property
+    def outputs(self) -> int:
+        """The count of the network's raw outputs. Of the numbers that describe the target, the network does not set
+        those of the interface."""
         return output_size(self.instances, self.target)
 
     @property
@@ -204,7 +218,7 @@ class Adapter:
         else:
             arrays = np.broadcast_arrays(wi.z, *inputs)[1:]
             raw = list(network.forward(self.layers, np.stack(arrays, axis=-1).astype(np.float32)).T)
-        return self.decode(raw, wi)
+        return self.decode(raw, wi, columns)
 
     def _check_columns(self, columns: Sequence[Float], wi: Vec3, kind: str) -> None:
         """Raises `ParamError` for arguments of `prepare` that do not fit together. `kind` is the array package.
@@ -224,13 +238,14 @@ class Adapter:
                 "arrays (n,) of one length n"
             )
 
-    def decode(self, raw: Sequence[Float], wi: Vec3) -> Brdf:
-        """The BRDF for the view direction `wi` from the raw outputs of the network.
+    def decode(self, raw: Sequence[Float], wi: Vec3, columns: Sequence[Float] = ()) -> Brdf:
+        """The BRDF for the view direction `wi` from the raw outputs of the network, and from the `columns` of the
+        material's parameters.
 
         `prepare` calls this method, and so does `nma.render.curves`, which runs the network itself. The method calls
         the function `nma.target.decode`, and then sets `Blend.scale` if the adapter is `bounded`.
         """
-        return self._framed(decode(raw, self.instances, self.target, wi.z), wi)
+        return self._framed(decode(raw, self.instances, self.target, wi.z, self._interface_of(columns)), wi)
 
     def from_numbers(self, flat: Sequence[Float], wi: Vec3) -> Brdf:
         """The BRDF for the view direction `wi` from the flat list of numbers that describe the target. `flat` has one
@@ -240,7 +255,15 @@ class Adapter:
         `nma.target.from_numbers`, which returns a blend without `scale`, and then computes `Blend.scale` again if the
         adapter is `bounded`.
         """
-        return self._framed(from_numbers(flat, self.target), wi)
+        return self._framed(from_numbers(flat, self.target, self.interface is not None), wi)
+
+    def _interface_of(self, columns: Sequence[Float]) -> Interface | None:
+        """The interface above the target. A single material's interface is known without its `columns`."""
+        if self.interface is None:
+            return None
+        known = self.material
+        values = columns if len(columns) or known is None else known.tolist()
+        return Interface(*(values[self.space.slices[name].start] for name in self.interface))
 
     def _framed(self, blend: Blend, wi: Vec3) -> Brdf:
         blend = bounded(blend, wi.z) if self.bounded else blend
@@ -294,12 +317,28 @@ class Adapter:
                 f"{path}: the lobes stretch along the plane of incidence, but the network does not read the view "
                 "direction; train again"
             )
+        self._check_interface(path)
         inputs = encoding.size(self.encoding, self.space, self.directional)
         found = self.layers[0][0].shape[1], self.layers[-1][0].shape[0]
-        if found != (inputs, self.size):
+        if found != (inputs, self.outputs):
             raise WeightsError(
                 f"{path}: the network maps {found[0]} inputs to {found[1]} outputs, "
-                f"but the metadata says {inputs} to {self.size}; train again"
+                f"but the metadata says {inputs} to {self.outputs}; train again"
+            )
+
+    def _check_interface(self, path: Path) -> None:
+        """Raises `WeightsError` if the parameters of the interface are not two numbers of the class, or if the target
+        has parameters that need an interface, but the file names none."""
+        sizes = {param.name: param.size for param in self.space.params}
+        if self.interface is None:
+            if needs_interface(self.target):
+                raise WeightsError(
+                    f"{path}: the target lies under an interface, which the file does not name"
+                )
+        elif [sizes.get(name) for name in self.interface] != [1, 1]:
+            raise WeightsError(
+                f"{path}: the interface needs two numbers of the class {self.space.name}, got "
+                f"{shown(', '.join(map(str, self.interface)))}; train again"
             )
 
     def _check_material(self, path: Path) -> None:

@@ -39,7 +39,9 @@ class Header:
     `parameters` declares the parameters of the class, so that programs in other languages do not need this package.
     `reciprocal` is true if the target does not depend on the view direction. `target` lists the target's parameters
     with their ranges. `dialect` names the version of the Principled BRDF. `bounded` says whether the target is dimmed
-    where it might reflect more light than it receives. `training` records how the weights were made.
+    where it might reflect more light than it receives. `interface` names the two parameters of the class that are the
+    width and the index of the interface under which the target lies; it is empty for other targets. `skip` says whether
+    the last layer reads the network's inputs, too (`nma.network`). `training` records how the weights were made.
     """
 
     class_name: str
@@ -54,6 +56,8 @@ class Header:
     bounded: bool = False
     training: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
+    interface: list[str] = field(default_factory=list)
+    skip: bool = False
 
 
 def describe(space: ParamSpace) -> list[dict[str, Any]]:
@@ -239,6 +243,8 @@ def _layers(path: Path, header: Header, tensors: dict[str, np.ndarray]) -> Layer
                 f"{path}: tensor {e} is missing; copy the file again, or train again"
             ) from None
         fan_in = layers[-1][0].shape[0] if layers else matrix.shape[-1] if matrix.ndim else 0
+        if header.skip and layers and number == len(header.hidden):
+            fan_in += layers[0][0].shape[1]
         if matrix.ndim != 2 or matrix.shape[1] != fan_in or bias.shape != matrix.shape[:1]:
             raise WeightsError(
                 f"{path}: layer {number} has weights of shape {matrix.shape} and biases of shape {bias.shape}, which "

@@ -93,7 +93,7 @@ def _network(name: str | None) -> str | None:
 
 
 # The allowed values of options. A test checks that `nma.train.recipe.Recipe` and `nma.params` declare the same values.
-TARGETS = ("principled", "stretched", "measured", "anisotropic")
+TARGETS = ("principled", "stretched", "interface", "measured", "anisotropic")
 POINTS_LAWS = ("crowded", "uniform", "centre")
 LOSSES = ("huber", "log")
 POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
@@ -114,7 +114,8 @@ Target = Annotated[
     str | None,
     choice(
         "principled: the paper's 11 numbers per instance. stretched: lobes can also stretch along the plane of "
-        "incidence. measured: they can also fade out. anisotropic: as measured, along the axes of the surface.",
+        "incidence. interface: they lie under the coat of the class. measured: they can also fade out. "
+        "anisotropic: as measured, along the axes of the surface.",
         *TARGETS,
     ),
 ]

@@ -117,7 +117,7 @@ def _prepare(adapter: Adapter, layers: list[Any], columns: Sequence[Float], wi: 
     inputs = encoding.get(adapter.encoding)(columns, wi if adapter.directional else None)
     x = mi.TensorXf(_interleaved(inputs, dr.width(wi.z)), (dr.width(wi.z), len(inputs)))
     raw = network.forward(layers, x)
-    return adapter.decode([raw[:, k].array for k in range(adapter.size)], wi)
+    return adapter.decode([raw[:, k].array for k in range(adapter.outputs)], wi, columns)
 
 
 def _interleaved(values: Sequence[Float], width: int) -> Float:

@@ -7,6 +7,7 @@ from nma.target.blend import Blend, bounded, eval, eval_pdf, lobe_alphas, pdf, s
 from nma.target.brdf import Brdf
 from nma.target.decode import (
     ANISOTROPIC_PARAMS,
+    INTERFACE_PARAMS,
     MEASURED_PARAMS,
     PRINCIPLED_PARAMS,
     STRETCHED_PARAMS,
@@ -15,20 +16,24 @@ from nma.target.decode import (
     decode,
     encode,
     from_numbers,
+    needs_interface,
     numbers,
     output_size,
 )
+from nma.target.interface import Interface
 from nma.target.plane import Plane
 from nma.target.principled import Principled, eval_principled
 
 __all__ = [
     "ANISOTROPIC_PARAMS",
+    "INTERFACE_PARAMS",
     "MEASURED_PARAMS",
     "PRINCIPLED_PARAMS",
     "STRETCHED_PARAMS",
     "TARGETS",
     "Blend",
     "Brdf",
+    "Interface",
     "Plane",
     "Principled",
     "TargetParam",
@@ -40,6 +45,7 @@ __all__ = [
     "eval_principled",
     "from_numbers",
     "lobe_alphas",
+    "needs_interface",
     "numbers",
     "output_size",
     "pdf",

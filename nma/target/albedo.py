@@ -13,10 +13,12 @@ from typing import NamedTuple
 
 from nma import ops
 from nma.ops import Color, Float
+from nma.target.interface import Interface, cos_below
 from nma.target.principled import (
     CLEARCOAT_F0,
     CLEARCOAT_MASKING_ALPHA,
     Principled,
+    dielectric_reflectance,
     luminance_inverse,
     schlick_weight,
     spec_alpha,
@@ -30,6 +32,7 @@ MIN_ALBEDO = 1e-4
 SPEC_MARGIN = 0.009
 CLEARCOAT_MARGIN = 0.005
 SHEEN_MARGIN = 0.0005
+INTERFACE_MARGIN = 0.007
 # Cosine-weighted means over the hemisphere of wo: _W0 is the mean of the Schlick weight of wo, _W1 that of the weight
 # times cos(theta_o), and _W2 that of the weight times cos^2(theta_o).
 _W0, _W1, _W2 = 1.0 / 21.0, 1.0 / 84.0, 1.0 / 252.0
@@ -53,6 +56,31 @@ def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
         spec_albedo(p, cos_theta_i) + MIN_ALBEDO,
         clearcoat_albedo(p, cos_theta_i, weight),
     )
+
+
+def lobe_albedos_below(p: Principled, interface: Interface, cos_theta_i: Float) -> Albedos:
+    """The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
+    interface's own lobe. The bounds ignore `veil` and `absorption`, which only dim."""
+    return Albedos(
+        diffuse_albedo(p, cos_theta_i, schlick_weight(cos_theta_i)) + MIN_ALBEDO,
+        spec_albedo(p, cos_below(cos_theta_i, interface.eta)) + MIN_ALBEDO,
+        interface_albedo(interface, cos_theta_i),
+    )
+
+
+def interface_albedo(interface: Interface, cos: Float) -> Float:
+    """The bound of the interface's own lobe: a bound of the masking, times the reflectance of a typical facet.
+
+    The bound is closer than that of `spec_albedo`, because together with the light from below the interface, the lobe
+    often reflects nearly all light. Widths above .3 have the bound of .3.
+    """
+    alpha = ops.minimum(interface.alpha, 0.3)
+    grazing = cos / alpha
+    tilt = 0.37 * alpha / (alpha + 0.205)
+    facet2 = ops.minimum(cos * cos + tilt * tilt / (1.0 + 0.2 * grazing), 1.0)
+    masked = 0.15 / (1.0 + 0.22 * grazing * grazing) + alpha * (0.87 - 1.7 * cos)
+    unmasked = ops.minimum(1.0 - masked + 0.3 * ops.maximum(interface.eta - 2.0, 0.0), 1.0)
+    return dielectric_reflectance(ops.sqrt(facet2), facet2, interface.eta) * unmasked + INTERFACE_MARGIN
 
 
 def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:

@@ -15,6 +15,7 @@ from nma import ops
 from nma.errors import WeightsError
 from nma.ops import Color, Float
 from nma.target.blend import Blend
+from nma.target.interface import Interface
 from nma.target.principled import MIN_ALPHA, Principled
 
 Scale = Literal["linear", "log"]
@@ -74,6 +75,13 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
 # plane.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
+# Instances under an interface, whose width and index the class gives (`nma.target.interface`), have no clearcoat.
+INTERFACE_PARAMS = (
+    *(p for p in STRETCHED_PARAMS if not p.name.startswith("clearcoat")),
+    TargetParam("veil"),
+    TargetParam("absorption", high=4.0),
+)
+
 # Measured materials need three more parameters. A fade is needed for RGL's measurements, for example. These
 # measurements are zero where the half vector is tilted by more than about 70 degrees, which the instrument does not
 # reach. A wide fade also changes the shape of the diffuse lobe.
@@ -93,11 +101,13 @@ _LIMITS = {
     "anisotropic": (-1e6, 1.0),
     "fade": (-1.0, 1.0),
     "fade_width": (0.0, 1e6),
+    "absorption": (0.0, 1e3),
 }
 
 TARGETS = {
     "principled": PRINCIPLED_PARAMS,
     "stretched": STRETCHED_PARAMS,
+    "interface": INTERFACE_PARAMS,
     "measured": MEASURED_PARAMS,
     "anisotropic": ANISOTROPIC_PARAMS,
 }
@@ -146,6 +156,11 @@ def _check(p: TargetParam) -> None:
         raise WeightsError(f"Target parameter {p} has no valid range within {low:g} .. {high:g}.")
 
 
+def needs_interface(params: Sequence[TargetParam]) -> bool:
+    """Whether the parameters have a meaning only under an interface."""
+    return any(p.name in ("veil", "absorption") for p in params)
+
+
 def limits(field: str) -> tuple[float, float]:
     """The range on which a field of `Principled` is defined. The range of the field's `TargetParam` must lie within
     this range."""
@@ -174,11 +189,13 @@ def decode(
     n_instances: int,
     params: Sequence[TargetParam] = PRINCIPLED_PARAMS,
     cos_theta_i: Float = 0.0,
+    interface: Interface | None = None,
 ) -> Blend:
     """Converts raw network outputs, `output_size` of them, to a blend. `Adapter.decode` calls this function.
 
     The weights come from stick-breaking: each weight is a fraction of the remainder that the previous weights leave of
-    1, and the last weight is the final remainder. `cos_theta_i` is used for parameters that are `in_plane`.
+    1, and the last weight is the final remainder. `cos_theta_i` is used for parameters that are `in_plane`. `interface`
+    is the interface above the instances, if there is one.
     """
     size = instance_size(params)
     instances = tuple(
@@ -191,7 +208,7 @@ def decode(
         share = ops.sigmoid(x)
         weights.append(left * share)
         left = left * (1.0 - share)
-    return Blend(instances, (*weights, left))
+    return Blend(instances, (*weights, left), interface=interface)
 
 
 def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
@@ -209,7 +226,8 @@ def encode(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> l
 
 
 def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> list[Float]:
-    """The blend as a flat list: all parameters, then all weights except the last. The list does not contain `scale`.
+    """The blend as a flat list: all parameters, then all weights except the last, then the two numbers of the interface
+    if there is one. The list does not contain `scale`.
 
     `Adapter.numbers` and the curves of `nma.render` call this function. The curves can interpolate the flat lists,
     because every convex combination of flat lists describes a valid blend.
@@ -219,15 +237,21 @@ def numbers(blend: Blend, params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> 
         for param in params:
             value = getattr(p, param.name)
             flat += list(value) if param.size > 1 else [value]
-    return flat + list(blend.weights[:-1])
+    return flat + list(blend.weights[:-1]) + list(blend.interface or ())
 
 
-def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPLED_PARAMS) -> Blend:
+def from_numbers(
+    flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPLED_PARAMS, under_interface: bool = False
+) -> Blend:
     """The inverse of `numbers`, except that `scale` is 1. `Adapter.from_numbers` calls this function, and then computes
     `scale` again if the adapter is bounded.
 
-    The number of instances follows from the length of the list.
+    The number of instances follows from the length of the list. With `under_interface`, the last two numbers are those
+    of the interface.
     """
+    interface = None
+    if under_interface:
+        flat, interface = flat[:-2], Interface(*flat[-2:])
     size = instance_size(params)
     n = (len(flat) + 1) // (size + 1)
     if n < 1 or len(flat) != output_size(n, params):
@@ -236,7 +260,7 @@ def from_numbers(flat: Sequence[Float], params: Sequence[TargetParam] = PRINCIPL
         )
     instances = tuple(_instance(flat[k * size : (k + 1) * size], params) for k in range(n))
     weights = tuple(flat[n * size :])
-    return Blend(instances, (*weights, 1.0 - sum(weights)))
+    return Blend(instances, (*weights, 1.0 - sum(weights)), interface=interface)
 
 
 def _decoded(raw: Sequence[Float], params: Sequence[TargetParam], cos_theta_i: Float) -> list[Float]:

@@ -44,7 +44,8 @@ class Principled(NamedTuple):
     The first nine fields hold the paper's 11 numbers, each in [0, 1] (`specular` up to 1.6). `anisotropic` stretches
     the specular lobe along x, and `flatness` blends towards the fake subsurface of Burley 2015. The whole BRDF fades
     out where the half vector's cosine to the normal is less than about `fade`. The fade is a smooth step of the width
-    `fade_width`. With the default values of `fade` and `fade_width`, the BRDF does not fade.
+    `fade_width`. With the default values of `fade` and `fade_width`, the BRDF does not fade. `veil` and `absorption`
+    dim an instance that lies under an interface, and only there have a meaning (`nma.target.interface`).
     """
 
     base_color: Color
@@ -60,6 +61,8 @@ class Principled(NamedTuple):
     flatness: Float = 0.0
     fade: Float = 0.0
     fade_width: Float = 0.0
+    veil: Float = 0.0
+    absorption: Float = 0.0
 
 
 class Geometry(NamedTuple):
@@ -162,6 +165,15 @@ def luminance_inverse(base_color: Color) -> Float:
     return 1.0 / ops.maximum(ops.luminance(base_color), 1e-6)
 
 
+def microfacet_lobe(g: Geometry, alpha_x: Float, alpha_y: Float) -> tuple[Float, Float]:
+    """A GGX reflection without its Fresnel term: its value, times cos(theta_o), and the density with which its visible
+    normals reflect light to `wo`, both [1/sr]."""
+    # The density is D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
+    pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
+    # The value is the density times the masking of `wo`. Walter 2007, eq. 20.
+    return pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y)), pdf
+
+
 def gtr1_d(m: Vec3, alpha: Float) -> Float:
     """GTR1 distribution of normals [1/sr], with 1 + (alpha^2 - 1) cos^2 written as sin^2 + alpha^2 cos^2.
 
@@ -215,10 +227,7 @@ def faded(p: Principled, cos_h: Float) -> Float:
 def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     """The value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe samples `wo` [1/sr]."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    # Density of directions reflected about visible normals: D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
-    spec_pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
-    # The value is the density `spec_pdf` times the masking of `wo` and the Fresnel term. Walter 2007, eq. 20.
-    spec = spec_pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y))
+    spec, spec_pdf = microfacet_lobe(g, alpha_x, alpha_y)
     # Density of directions reflected about normals drawn from D cos(theta_h): D cos(theta_h) / (4 cos_d).
     clearcoat_d = gtr1_d(g.h, clearcoat_alpha(p.clearcoat_gloss))
     clearcoat_pdf = clearcoat_d * g.h.z / (4.0 * g.cos_d)

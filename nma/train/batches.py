@@ -44,6 +44,8 @@ class Batch(NamedTuple):
     # (3, 2, rows) random shifts of the samples that estimate the target's albedo
     albedo_shift: NDArray[np.float32]
     quantum: NDArray[np.float32]  # (rows,) what one walk of throughput 1 adds to the value of a bin
+    # (2, rows) width and index of the interface above the material, or (0, rows) for a class without an interface
+    interface: NDArray[np.float32]
 
 
 @dataclass
@@ -55,11 +57,14 @@ class Pool:
     walks: NDArray[np.int64]
     albedo: NDArray[np.float32]  # (materials, theta_i[, phi_i], 3)
     grid: Grid = ISOTROPIC
+    interface: tuple[int, ...] = ()  # the columns of `params` that are the interface's width and index
 
     @staticmethod
     def of(tables: Tables) -> Pool:
         albedo = tables.albedo().astype(np.float32)
-        return Pool(tables.params.astype(np.float32), tables.values, tables.walks, albedo, tables.grid)
+        params = tables.params.astype(np.float32)
+        columns = tables.space.interface_columns
+        return Pool(params, tables.values, tables.walks, albedo, tables.grid, columns)
 
     def bins(self, m: NDArray, i: NDArray, a: NDArray, o: NDArray, p: NDArray) -> NDArray:
         """The values (..., 3) of some bins. Negative values become 0, because a BRDF is never negative."""
@@ -190,6 +195,7 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
         pool.albedo_at(m, i, a, mu).T.astype(f32),
         rng.random((3, 2, recipe.rows), dtype=f32),
         (pool.grid.rows / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
+        np.ascontiguousarray(pool.params[m][:, list(pool.interface)].T),
     )
 
 

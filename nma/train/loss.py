@@ -37,7 +37,8 @@ def brdf_of(layers: Layers, batch: Any, recipe: Recipe) -> Brdf:
     In isotropic batches wi has azimuth 0, so the frame of the plane of incidence equals the local frame.
     """
     raw = network_outputs(layers, batch, recipe)
-    blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu)
+    interface = target.Interface(*batch.interface) if recipe.target == "interface" else None
+    blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu, interface)
     return Brdf(target.bounded(blend, batch.mu) if recipe.bounds_energy else blend)
 
 

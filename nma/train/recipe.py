@@ -21,9 +21,11 @@ class Recipe:
     each row. The step runs the network once per row, and averages the target over `points` points per bin.
 
     - `target`: "principled" has the paper's 11 parameters per instance. "stretched" adds one parameter, which stretches
-      the specular lobe along the plane of incidence. "measured" adds three more parameters per instance: one flattens
-      the diffuse lobe, and two fade out the whole instance where the half vector is far from the normal. "anisotropic"
-      has the parameters of "measured", but stretches lobes along the axes of the surface.
+      the specular lobe along the plane of incidence. "interface" is for classes whose uppermost layer is the interface
+      of a rough dielectric: the instances lie under the interface, whose own reflection is exact
+      (`nma.target.interface`). "measured" adds to "stretched" three more parameters per instance: one flattens the
+      diffuse lobe, and two fade out the whole instance where the half vector is far from the normal. "anisotropic" has
+      the parameters of "measured", but stretches lobes along the axes of the surface.
     - `grid`: the resolution of the tables.
     - `bounded`: if true, the target is dimmed where it might reflect more light than it receives. Targets that are not
       `directional` are never dimmed.
@@ -48,7 +50,7 @@ class Recipe:
     network: str = "5x64"
     instances: int = 2
     directional: bool = True
-    target: Literal["principled", "stretched", "measured", "anisotropic"] = "principled"
+    target: Literal["principled", "stretched", "interface", "measured", "anisotropic"] = "interface"
     bounded: bool = True
     encoding: str = "layered3"
     rows: int = 512
@@ -81,7 +83,7 @@ class Recipe:
         for name, hint in get_type_hints(Recipe).items():
             if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
                 raise NmaError(f"{name} is one of {', '.join(get_args(hint))}; got '{getattr(self, name)}'")
-        if self.target in ("stretched", "measured") and not self.directional:
+        if self.target in ("stretched", "interface", "measured") and not self.directional:
             raise NmaError(
                 "a target stretched along the plane of incidence depends on the direction, so it cannot have constant "
                 "parameters; use the target 'principled'"
@@ -111,6 +113,7 @@ CLASS = Recipe()
 
 # The paper's recipe (section 3.4), for comparison.
 PAPER = Recipe(
+    target="principled",
     bounded=False,
     encoding="raw",
     rows=1000,
@@ -184,10 +187,13 @@ def preset(name: str, **changes) -> Recipe:
 def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
     """The preset `name` for a class, with `changes` as for `preset`.
 
-    If the preset's encoding is named after a class, it is replaced by the encoding of the class `space`, or by `raw` if
-    this class has no encoding.
+    If the preset's encoding is named after a class, it is replaced by the encoding of the class `space` for the target,
+    or by `raw` if this class has no encoding. If the class has no interface, the target "interface" of a preset becomes
+    "stretched".
     """
     recipe = preset(name, **changes)
+    if space.interface is None and recipe.target == "interface" and changes.get("target") is None:
+        recipe = replace(recipe, target="stretched")
     if recipe.encoding not in sources.classes():
         return recipe
-    return replace(recipe, encoding=space.name if space.name in encoding.ENCODERS else "raw")
+    return replace(recipe, encoding=encoding.of_class(space, under_interface=recipe.target == "interface"))

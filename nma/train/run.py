@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nma import network, target
 from nma.adapter import Adapter, encoding
+from nma.errors import NmaError
 from nma.network import Layers
 from nma.ops import Color
 from nma.params import ParamSpace
@@ -36,17 +37,51 @@ _INITIAL = Blend(
     ),
     (0.6, 0.4),
 )
+# The same for instances under an interface: a metal, and what the layers between scatter.
+_INITIAL_BELOW = Blend(
+    (
+        Principled(Color(0.6, 0.6, 0.6), 0.35, 0.95, 0.5, 0.1, 0.05, 0.1, 0.0, 0.0, veil=0.9, absorption=0.1),
+        Principled(Color(0.4, 0.4, 0.4), 0.7, 0.3, 0.5, 0.1, 0.05, 0.1, 0.0, 0.0, veil=0.9, absorption=0.1),
+    ),
+    (0.8, 0.2),
+)
 
 
 def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
-    """Random layers, determined by the recipe's seed, whose outputs are close to the blend `_INITIAL`."""
-    instances = tuple(_INITIAL.instances[k % 2] for k in range(recipe.instances))
+    """Random layers, determined by the recipe's seed, whose outputs are close to the blend `_INITIAL` or
+    `_INITIAL_BELOW`.
+
+    Raises `NmaError` if the target lies under an interface, but the class has none.
+    """
+    if recipe.target == "interface" and space.interface is None:
+        raise NmaError(
+            f"the class {space.name} has no interface, under which the target 'interface' lies; choose the target "
+            "'stretched'"
+        )
+    start = _INITIAL_BELOW if recipe.target == "interface" else _INITIAL
+    instances = tuple(start.instances[k % 2] for k in range(recipe.instances))
     blend = Blend(instances, (1.0 / recipe.instances,) * recipe.instances)
     params = target.TARGETS[recipe.target]
-    bias = np.array(target.encode(blend if recipe.instances != 2 else _INITIAL, params))
+    bias = np.array(target.encode(blend if recipe.instances != 2 else start, params))
     inputs = encoding.size(recipe.encoding, space, recipe.directional)
     sizes = [inputs, *network.hidden(recipe.network), target.output_size(recipe.instances, params)]
-    return network.init(np.random.default_rng((recipe.seed, 0x1417)), sizes, bias)
+    skip = _estimates(recipe, inputs, len(bias))
+    if skip is not None:
+        bias[skip.any(axis=1)] = 0.0
+    return network.init(np.random.default_rng((recipe.seed, 0x1417)), sizes, bias, skip)
+
+
+def _estimates(recipe: Recipe, inputs: int, outputs: int) -> NDArray[np.float32] | None:
+    """The weights (outputs, inputs) by which the last layer passes on estimates among the inputs to the outputs that
+    they estimate. None if the recipe's encoding has no estimates."""
+    estimated = encoding.ESTIMATES.get(recipe.encoding, ())
+    names = [p.name for p in target.TARGETS[recipe.target] for _ in range(p.size)]
+    rows = [names.index(name) + k for name in estimated for k in range(names.count(name))]
+    if not rows:
+        return None
+    skip = np.zeros((outputs, inputs), np.float32)
+    skip[rows, np.arange(inputs - len(rows), inputs)] = encoding.ESTIMATE_UNIT
+    return skip
 
 
 def train_class(
@@ -128,6 +163,7 @@ def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[st
         target.TARGETS[recipe.target],
         training,
         recipe.bounds_energy,
+        space.interface if recipe.target == "interface" else None,
     )
 
 
