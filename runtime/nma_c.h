@@ -33,7 +33,7 @@ typedef struct nma_curves nma_curves;
 
 /* A BRDF at one shading point. The address of an `nma_brdf` must be a multiple of 16 bytes. */
 typedef struct {
-    NMA_ALIGNED float opaque[168];
+    NMA_ALIGNED float opaque[184];
 } nma_brdf;
 /* The former name of `nma_brdf`. */
 typedef nma_brdf nma_material;

@@ -20,13 +20,15 @@ from typing import Any
 
 from nma import microfacet
 from nma.errors import NmaError
-from nma.target import albedo, plane, principled, sampling
+from nma.target import albedo, interface, plane, principled, sampling
 
 STRUCTURES: tuple[type, ...] = (
     principled.Principled,
     principled.Geometry,
     principled.Terms,
     principled.Lobes,
+    interface.Interface,
+    interface.Crossing,
     albedo.Albedos,
     plane.Plane,
 )
@@ -50,18 +52,26 @@ FUNCTIONS: tuple[Callable, ...] = (
     principled.specular_eta,
     principled.dielectric_reflectance,
     principled.luminance_inverse,
+    principled.microfacet_lobe,
     principled.gtr1_d,
     principled.diffuse_terms,
     principled.spec_fresnel,
     principled.faded,
     principled.eval_pdf_lobes,
+    interface.cos_below,
+    interface.refracted,
+    interface.crossing,
+    interface.eval_pdf_lobes_below,
     albedo.diffuse_albedo,
     albedo.spec_albedo,
     albedo.clearcoat_albedo,
     albedo.lobe_albedos,
+    albedo.interface_albedo,
+    albedo.lobe_albedos_below,
     sampling.sample_diffuse,
     sampling.sample_spec,
     sampling.sample_clearcoat,
+    interface.sample_below,
     plane.Plane.of,
     plane.Plane.enter,
     plane.Plane.leave,

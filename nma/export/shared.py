@@ -21,7 +21,7 @@ _GENERAL = (
     (weights, ("FORMAT", "MAX_DEPTH")),
     (adapter, ("SAME",)),
     (params, ("ROUNDING",)),
-    (encoding, ("GRAZING", "MIN_COS_T")),
+    (encoding, ("GRAZING", "MIN_COS_T", "LEAST_ESTIMATE", "ESTIMATE_UNIT")),
 )
 _LAYERED = (
     (layered, ("ROULETTE_THRESHOLD", "TRAPPED_SURVIVAL")),

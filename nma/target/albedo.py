@@ -61,9 +61,11 @@ def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
 def lobe_albedos_below(p: Principled, interface: Interface, cos_theta_i: Float) -> Albedos:
     """The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
     interface's own lobe. The bounds ignore `veil` and `absorption`, which only dim."""
+    weight = schlick_weight(cos_theta_i)
+    below = cos_below(cos_theta_i, interface.eta, 1.0 / interface.eta)
     return Albedos(
-        diffuse_albedo(p, cos_theta_i, schlick_weight(cos_theta_i)) + MIN_ALBEDO,
-        spec_albedo(p, cos_below(cos_theta_i, interface.eta)) + MIN_ALBEDO,
+        diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO,
+        spec_albedo(p, below) + MIN_ALBEDO,
         interface_albedo(interface, cos_theta_i),
     )
 

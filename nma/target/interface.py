@@ -22,8 +22,8 @@ from nma.target.principled import (
     Principled,
     dielectric_reflectance,
     diffuse_terms,
-    geometry,
     microfacet_lobe,
+    schlick_weight,
     spec_alpha,
     spec_fresnel,
 )
@@ -43,7 +43,10 @@ class Interface(NamedTuple):
 class Crossing(NamedTuple):
     """Quantities of one pair of directions that all instances under an interface use."""
 
-    below: Geometry  # the geometry of the refracted directions
+    wi: Vec3  # the refracted directions, mirrored to point up
+    wo: Vec3
+    cos_d: Float  # cosine between either of them and their half vector
+    weight_d: Float  # Schlick weight of `cos_d`
     jacobian: Float  # solid angle below the interface per solid angle of `wo`
     lost: Float  # the part of the light towards `wo` that the interface reflects back down
     path: Float  # length of the way up along the refracted `wo`, in depths, minus 1
@@ -51,29 +54,30 @@ class Crossing(NamedTuple):
     pdf: Float  # the density with which the interface's own lobe samples `wo`
 
 
-def cos_below(cos: Float, eta: Float) -> Float:
-    """The cosine of a direction after its refraction at a smooth interface."""
-    return ops.sqrt(eta * eta - 1.0 + cos * cos) / eta
+def cos_below(cos: Float, eta: Float, inverse: Float) -> Float:
+    """The cosine of a direction after its refraction at a smooth interface. `inverse` is 1 / eta."""
+    return ops.sqrt(eta * eta - 1.0 + cos * cos) * inverse
 
 
-def refracted(v: Vec3, eta: Float) -> Vec3:
-    """The direction `v` refracted at a smooth interface, and mirrored to point up."""
-    return Vec3(v.x / eta, v.y / eta, cos_below(v.z, eta))
+def refracted(v: Vec3, eta: Float, inverse: Float) -> Vec3:
+    """The direction `v` refracted at a smooth interface, and mirrored to point up. `inverse` is 1 / eta."""
+    return Vec3(v.x * inverse, v.y * inverse, cos_below(v.z, eta, inverse))
 
 
 def crossing(interface: Interface, g: Geometry) -> Crossing:
     """What an interface does with the directions of `g`."""
     eta = interface.eta
-    below = geometry(refracted(g.wi, eta), refracted(g.wo, eta))
-    lobe, pdf = microfacet_lobe(g, interface.alpha, interface.alpha)
-    return Crossing(
-        below,
-        g.wo.z / (eta * eta * below.wo.z),
-        dielectric_reflectance(g.wo.z, g.wo.z * g.wo.z, eta),
-        1.0 / below.wo.z - 1.0,
-        lobe * dielectric_reflectance(g.cos_d, g.cos_d * g.cos_d, eta),
-        pdf,
-    )
+    inverse = 1.0 / eta
+    wi = refracted(g.wi, eta, inverse)
+    wo = refracted(g.wo, eta, inverse)
+    h = wi + wo
+    cos_d = 0.5 * ops.sqrt(ops.dot(h, h))
+    way = 1.0 / wo.z
+    jacobian = g.wo.z * inverse * inverse * way
+    lost = dielectric_reflectance(g.wo.z, g.wo.z * g.wo.z, eta)
+    lobe, pdf = microfacet_lobe(g.wi, g.wo, interface.alpha, interface.alpha)
+    value = lobe * dielectric_reflectance(g.cos_d, g.cos_d * g.cos_d, eta)
+    return Crossing(wi, wo, cos_d, schlick_weight(cos_d), jacobian, lost, way - 1.0, value, pdf)
 
 
 def eval_pdf_lobes_below(p: Principled, g: Geometry, c: Crossing) -> Lobes:
@@ -82,8 +86,8 @@ def eval_pdf_lobes_below(p: Principled, g: Geometry, c: Crossing) -> Lobes:
     The value contains the interface's own reflection, and `clearcoat_pdf` is the density of this reflection.
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    spec, spec_pdf = microfacet_lobe(c.below, alpha_x, alpha_y)
-    fresnel = spec_fresnel(p, c.below.cos_d, c.below.cos_d * c.below.cos_d, c.below.weight_d)
+    spec, spec_pdf = microfacet_lobe(c.wi, c.wo, alpha_x, alpha_y)
+    fresnel = spec_fresnel(p, c.cos_d, c.cos_d * c.cos_d, c.weight_d)
     diffuse = diffuse_terms(p, g)
     left = (1.0 - p.veil * c.lost) * ops.exp(ops.maximum(-p.absorption * c.path, _LEAST_EXPONENT))
     density = c.jacobian * spec_pdf
@@ -96,7 +100,7 @@ def eval_pdf_lobes_below(p: Principled, g: Geometry, c: Crossing) -> Lobes:
 def sample_below(wi: Vec3, eta: Float, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) -> Vec3:
     """A direction of a specular lobe under an interface. The direction points below the horizon where the interface
     reflects all light back down, or where the lobe itself leads down."""
-    o = sample_spec(refracted(wi, eta), alpha_x, alpha_y, u1, u2)
+    o = sample_spec(refracted(wi, eta, 1.0 / eta), alpha_x, alpha_y, u1, u2)
     cos2 = 1.0 - eta * eta * (1.0 - o.z * o.z)
     leaves = (o.z > 0.0) & (cos2 > 0.0)
     up = ops.sqrt(ops.select(leaves, cos2, 1.0))

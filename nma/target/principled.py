@@ -28,7 +28,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from nma import ops
-from nma.microfacet import ggx_d
 from nma.ops import Color, Float, Mask, Vec3
 
 DIALECT = "mitsuba-principled-reflection"
@@ -165,13 +164,22 @@ def luminance_inverse(base_color: Color) -> Float:
     return 1.0 / ops.maximum(ops.luminance(base_color), 1e-6)
 
 
-def microfacet_lobe(g: Geometry, alpha_x: Float, alpha_y: Float) -> tuple[Float, Float]:
+def microfacet_lobe(wi: Vec3, wo: Vec3, alpha_x: Float, alpha_y: Float) -> tuple[Float, Float]:
     """A GGX reflection without its Fresnel term: its value, times cos(theta_o), and the density with which its visible
     normals reflect light to `wo`, both [1/sr]."""
-    # The density is D G1(wi) / (4 cos_i). Heitz 2018, eq. 17.
-    pdf = 0.5 * ggx_d(g.h, alpha_x, alpha_y) / masking_denominator(g.wi, alpha_x, alpha_y)
-    # The value is the density times the masking of `wo`. Walter 2007, eq. 20.
-    return pdf * (2.0 * g.wo.z / masking_denominator(g.wo, alpha_x, alpha_y)), pdf
+    # `ggx_d` of the half vector. The half vector is not normalised, which would take a square root and a division.
+    h = wi + wo
+    per_area = 1.0 / (alpha_x * alpha_y)
+    sx = h.x * alpha_y * per_area
+    sy = h.y * alpha_x * per_area
+    ratio = ops.dot(h, h) / (sx * sx + sy * sy + h.z * h.z)
+    d = ops.INV_PI * per_area * ratio * ratio
+    # The density is D G1(wi) / (4 cos_i). Heitz 2018, eq. 17. The value is the density times the masking of `wo`.
+    # Walter 2007, eq. 20.
+    masked_i = masking_denominator(wi, alpha_x, alpha_y)
+    masked_o = masking_denominator(wo, alpha_x, alpha_y)
+    value = d * (1.0 / (masked_i * masked_o))
+    return value * wo.z, 0.5 * value * masked_o
 
 
 def gtr1_d(m: Vec3, alpha: Float) -> Float:
@@ -227,7 +235,7 @@ def faded(p: Principled, cos_h: Float) -> Float:
 def eval_pdf_lobes(p: Principled, g: Geometry) -> Lobes:
     """The value of one instance, f cos(theta_o) [1/sr], and the density with which each lobe samples `wo` [1/sr]."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    spec, spec_pdf = microfacet_lobe(g, alpha_x, alpha_y)
+    spec, spec_pdf = microfacet_lobe(g.wi, g.wo, alpha_x, alpha_y)
     # Density of directions reflected about normals drawn from D cos(theta_h): D cos(theta_h) / (4 cos_d).
     clearcoat_d = gtr1_d(g.h, clearcoat_alpha(p.clearcoat_gloss))
     clearcoat_pdf = clearcoat_d * g.h.z / (4.0 * g.cos_d)

@@ -15,6 +15,8 @@ constexpr float ROUNDING = 1e-06f;
 // Constants of nma/adapter/encoding.py
 constexpr float GRAZING = 0.1045f;
 constexpr float MIN_COS_T = 0.05f;
+constexpr float LEAST_ESTIMATE = 0.01f;
+constexpr float ESTIMATE_UNIT = 2.5f;
 
 // The constants of the simulated layered material.
 namespace layered {

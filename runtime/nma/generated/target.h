@@ -14,6 +14,7 @@ template <class T> constexpr T CLEARCOAT_F0 = T(0.04);
 template <class T> constexpr T MIN_COS = T(1e-09);
 template <class T> constexpr T CLEARCOAT_MASKING_ALPHA = T(0.25);
 template <class T> constexpr T MIN_ALPHA = T(0.001);
+template <class T> constexpr T LEAST_EXPONENT = T(-87.0);
 template <class T> constexpr T SHEEN_MARGIN = T(0.0005);
 template <class T> constexpr T W0 = T(0.047619047619047616);
 template <class T> constexpr T W1 = T(0.011904761904761904);
@@ -21,6 +22,7 @@ template <class T> constexpr T W2 = T(0.003968253968253968);
 template <class T> constexpr T SPEC_MARGIN = T(0.009);
 template <class T> constexpr T CLEARCOAT_MARGIN = T(0.005);
 template <class T> constexpr T MIN_ALBEDO = T(0.0001);
+template <class T> constexpr T INTERFACE_MARGIN = T(0.007);
 
 // Parameters of one Principled BRDF.
 template <class T>
@@ -38,6 +40,8 @@ struct Principled {
     T flatness;
     T fade;
     T fade_width;
+    T veil;
+    T absorption;
 };
 
 // Quantities of one pair of directions that all lobes of all instances use.
@@ -68,6 +72,27 @@ struct Lobes {
     T diffuse_pdf;
     T spec_pdf;
     T clearcoat_pdf;
+};
+
+// The interface above all instances: its GGX width, and the index of refraction below it (at least 1).
+template <class T>
+struct Interface {
+    T alpha;
+    T eta;
+};
+
+// Quantities of one pair of directions that all instances under an interface use.
+template <class T>
+struct Crossing {
+    Vec3<T> wi;
+    Vec3<T> wo;
+    T cos_d;
+    T weight_d;
+    T jacobian;
+    T lost;
+    T path;
+    T value;
+    T pdf;
 };
 
 // Upper bounds of the directional albedo of each lobe of an instance.
@@ -107,6 +132,8 @@ constexpr Field FIELDS[] = {
     {"flatness", offsetof(Principled<float>, flatness) / sizeof(float), 1, 0.0, 1.0},
     {"fade", offsetof(Principled<float>, fade) / sizeof(float), 1, -1.0, 1.0},
     {"fade_width", offsetof(Principled<float>, fade_width) / sizeof(float), 1, 0.0, 1000000.0},
+    {"veil", offsetof(Principled<float>, veil) / sizeof(float), 1, 0.0, 1.0},
+    {"absorption", offsetof(Principled<float>, absorption) / sizeof(float), 1, 0.0, 1000.0},
 };
 
 // GGX distribution D(m) [1/sr]: the area of microfacets with normal `m` per solid angle and unit of surface area.
@@ -263,6 +290,22 @@ inline T luminance_inverse(const Vec3<T>& base_color) {
     return T(1.0) / maximum(luminance(base_color), T(1e-06));
 }
 
+// A GGX reflection without its Fresnel term: its value, times cos(theta_o), and the density with which its visible
+// normals reflect light to `wo`, both [1/sr].
+template <class T>
+inline std::tuple<T, T> microfacet_lobe(const Vec3<T>& wi, const Vec3<T>& wo, T alpha_x, T alpha_y) {
+    const auto h = wi + wo;
+    const auto per_area = T(1.0) / (alpha_x * alpha_y);
+    const auto sx = h.x * alpha_y * per_area;
+    const auto sy = h.y * alpha_x * per_area;
+    const auto ratio = dot(h, h) / (sx * sx + sy * sy + h.z * h.z);
+    const auto d = INV_PI<T> * per_area * ratio * ratio;
+    const auto masked_i = masking_denominator<T>(wi, alpha_x, alpha_y);
+    const auto masked_o = masking_denominator<T>(wo, alpha_x, alpha_y);
+    const auto value = d * (T(1.0) / (masked_i * masked_o));
+    return {value * wo.z, T(0.5) * value * masked_o};
+}
+
 // GTR1 distribution of normals [1/sr], with 1 + (alpha^2 - 1) cos^2 written as sin^2 + alpha^2 cos^2.
 template <class T>
 inline T gtr1_d(const Vec3<T>& m, T alpha) {
@@ -310,8 +353,7 @@ inline T faded(const Principled<T>& p, T cos_h) {
 template <class T>
 inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
-    const auto spec_pdf = T(0.5) * ggx_d<T>(g.h, alpha_x, alpha_y) / masking_denominator<T>(g.wi, alpha_x, alpha_y);
-    const auto spec = spec_pdf * (T(2.0) * g.wo.z / masking_denominator<T>(g.wo, alpha_x, alpha_y));
+    const auto [spec, spec_pdf] = microfacet_lobe<T>(g.wi, g.wo, alpha_x, alpha_y);
     const auto clearcoat_d = gtr1_d<T>(g.h, clearcoat_alpha<T>(p.clearcoat_gloss));
     const auto clearcoat_pdf = clearcoat_d * g.h.z / (T(4.0) * g.cos_d);
     const auto clearcoat = p.clearcoat * clearcoat_d * g.clearcoat;
@@ -321,6 +363,50 @@ inline Lobes<T> eval_pdf_lobes(const Principled<T>& p, const Geometry<T>& g) {
     const auto colored = left * (diffuse.colored + spec * fresnel.colored);
     const auto white = left * (diffuse.white + spec * fresnel.white + clearcoat);
     return Lobes<T>{p.base_color * colored + white, g.wo.z * INV_PI<T>, spec_pdf, clearcoat_pdf};
+}
+
+// The cosine of a direction after its refraction at a smooth interface. `inverse` is 1 / eta.
+template <class T>
+inline T cos_below(T cos, T eta, T inverse) {
+    return sqrt(eta * eta - T(1.0) + cos * cos) * inverse;
+}
+
+// The direction `v` refracted at a smooth interface, and mirrored to point up. `inverse` is 1 / eta.
+template <class T>
+inline Vec3<T> refracted(const Vec3<T>& v, T eta, T inverse) {
+    return Vec3<T>{v.x * inverse, v.y * inverse, cos_below<T>(v.z, eta, inverse)};
+}
+
+// What an interface does with the directions of `g`.
+template <class T>
+inline Crossing<T> crossing(const Interface<T>& interface, const Geometry<T>& g) {
+    const auto eta = interface.eta;
+    const auto inverse = T(1.0) / eta;
+    const auto wi = refracted<T>(g.wi, eta, inverse);
+    const auto wo = refracted<T>(g.wo, eta, inverse);
+    const auto h = wi + wo;
+    const auto cos_d = T(0.5) * sqrt(dot(h, h));
+    const auto way = T(1.0) / wo.z;
+    const auto jacobian = g.wo.z * inverse * inverse * way;
+    const auto lost = dielectric_reflectance<T>(g.wo.z, g.wo.z * g.wo.z, eta);
+    const auto [lobe, pdf] = microfacet_lobe<T>(g.wi, g.wo, interface.alpha, interface.alpha);
+    const auto value = lobe * dielectric_reflectance<T>(g.cos_d, g.cos_d * g.cos_d, eta);
+    return Crossing<T>{wi, wo, cos_d, schlick_weight<T>(cos_d), jacobian, lost, way - T(1.0), value, pdf};
+}
+
+// The value of one instance under an interface, f cos(theta_o) [1/sr], and the densities of its lobes.
+template <class T>
+inline Lobes<T> eval_pdf_lobes_below(const Principled<T>& p, const Geometry<T>& g, const Crossing<T>& c) {
+    const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
+    const auto [spec, spec_pdf] = microfacet_lobe<T>(c.wi, c.wo, alpha_x, alpha_y);
+    const auto fresnel = spec_fresnel<T>(p, c.cos_d, c.cos_d * c.cos_d, c.weight_d);
+    const auto diffuse = diffuse_terms<T>(p, g);
+    const auto left = (T(1.0) - p.veil * c.lost) * exp(maximum(-p.absorption * c.path, LEAST_EXPONENT<T>));
+    const auto density = c.jacobian * spec_pdf;
+    const auto value = c.jacobian * spec;
+    const auto colored = left * (diffuse.colored + value * fresnel.colored);
+    const auto white = left * (diffuse.white + value * fresnel.white) + c.value;
+    return Lobes<T>{p.base_color * colored + white, g.wo.z * INV_PI<T>, density, c.pdf};
 }
 
 // The bound of the diffuse lobe: the closed-form integral of base and retro-reflection, plus a fitted formula for the
@@ -372,6 +458,28 @@ inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
                       spec_albedo<T>(p, cos_theta_i) + MIN_ALBEDO<T>, clearcoat_albedo<T>(p, cos_theta_i, weight)};
 }
 
+// The bound of the interface's own lobe: a bound of the masking, times the reflectance of a typical facet.
+template <class T>
+inline T interface_albedo(const Interface<T>& interface, T cos) {
+    const auto alpha = minimum(interface.alpha, T(0.3));
+    const auto grazing = cos / alpha;
+    const auto tilt = T(0.37) * alpha / (alpha + T(0.205));
+    const auto facet2 = minimum(cos * cos + tilt * tilt / (T(1.0) + T(0.2) * grazing), T(1.0));
+    const auto masked = T(0.15) / (T(1.0) + T(0.22) * grazing * grazing) + alpha * (T(0.87) - T(1.7) * cos);
+    const auto unmasked = minimum(T(1.0) - masked + T(0.3) * maximum(interface.eta - T(2.0), T(0.0)), T(1.0));
+    return dielectric_reflectance<T>(sqrt(facet2), facet2, interface.eta) * unmasked + INTERFACE_MARGIN<T>;
+}
+
+// The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
+// interface's own lobe. The bounds ignore `veil` and `absorption`, which only dim.
+template <class T>
+inline Albedos<T> lobe_albedos_below(const Principled<T>& p, const Interface<T>& interface, T cos_theta_i) {
+    const auto weight = schlick_weight<T>(cos_theta_i);
+    const auto below = cos_below<T>(cos_theta_i, interface.eta, T(1.0) / interface.eta);
+    return Albedos<T>{diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>,
+                      spec_albedo<T>(p, below) + MIN_ALBEDO<T>, interface_albedo<T>(interface, cos_theta_i)};
+}
+
 // A direction with density cos(theta) / pi.
 template <class T>
 inline Vec3<T> sample_diffuse(T u1, T u2) {
@@ -394,6 +502,18 @@ inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
     const auto sin2 = (exp(log(alpha2) * (T(1.0) - u2)) - alpha2) / (T(1.0) - alpha2);
     const auto sin_theta = safe_sqrt(sin2);
     return reflect<T>(wi, Vec3<T>{sin_theta * cos(phi), sin_theta * sin(phi), safe_sqrt(T(1.0) - sin2)});
+}
+
+// A direction of a specular lobe under an interface. The direction points below the horizon where the interface
+// reflects all light back down, or where the lobe itself leads down.
+template <class T>
+inline Vec3<T> sample_below(const Vec3<T>& wi, T eta, T alpha_x, T alpha_y, T u1, T u2) {
+    const auto o = sample_spec<T>(refracted<T>(wi, eta, T(1.0) / eta), alpha_x, alpha_y, u1, u2);
+    const auto cos2 = T(1.0) - eta * eta * (T(1.0) - o.z * o.z);
+    const auto leaves = o.z > T(0.0) && cos2 > T(0.0);
+    const auto up = sqrt(select(leaves, cos2, T(1.0)));
+    const auto bent = select(leaves, eta, T(1.0));
+    return Vec3<T>{bent * o.x, bent * o.y, select(leaves, up, -absolute(o.z))};
 }
 
 // The plane through the normal and the unit direction `wi`; at normal incidence, the plane of the x axis.
