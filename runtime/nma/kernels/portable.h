@@ -15,7 +15,7 @@ namespace nma::portable {
 constexpr int VEC_SIZE = 4, SINGLE_TILE = 4, BATCH_TILE = 4, BATCH_QUERIES = 2;
 
 #if defined(__GNUC__)
-typedef float Vec __attribute__((vector_size(16)));
+using Vec = detail::Floats;
 #else
 struct Vec {
     float lanes[VEC_SIZE];
@@ -51,6 +51,11 @@ NMA_OP Vec add(Vec a, Vec b) { return a + b; }
 NMA_OP Vec sub(Vec a, Vec b) { return a - b; }
 NMA_OP Vec mul(Vec a, Vec b) { return a * b; }
 NMA_OP Vec fma(Vec a, Vec b, Vec c) { return a * b + c; }
+NMA_OP Vec max(Vec a, Vec b) { return detail::most(a, b); }
+NMA_OP Vec min(Vec a, Vec b) { return detail::least(a, b); }
+NMA_OP Vec nearest(Vec x) { return __builtin_convertvector(detail::nearest(x), Vec); }
+NMA_OP Vec inverse(Vec a) { return 1.0f / a; }
+NMA_OP Vec scale(Vec a, Vec whole) { return a * (Vec)((__builtin_convertvector(whole, detail::Whole) + 127) << 23); }
 #else
 NMA_OP Vec add(Vec a, Vec b) {
     return each([&](int k) { return a[k] + b[k]; });
@@ -64,7 +69,6 @@ NMA_OP Vec mul(Vec a, Vec b) {
 NMA_OP Vec fma(Vec a, Vec b, Vec c) {
     return each([&](int k) { return a[k] * b[k] + c[k]; });
 }
-#endif
 NMA_OP Vec max(Vec a, Vec b) {
     return each([&](int k) { return a[k] > b[k] ? a[k] : b[k]; });
 }
@@ -81,6 +85,7 @@ NMA_OP Vec scale(Vec a, Vec whole) {
     return mul(
         a, each([&](int k) { return from_bits(static_cast<std::uint32_t>(static_cast<int>(whole[k]) + 127) << 23); }));
 }
+#endif
 NMA_OP Vec even(const std::uint32_t* pairs) {
     return each([&](int k) { return from_bits(pairs[k] << 16); });
 }
