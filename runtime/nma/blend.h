@@ -6,6 +6,7 @@
 #pragma once
 
 #include "generated/target.h"
+#include "kernels/macros.h"
 #include "lanes.h"
 
 namespace nma {
@@ -32,10 +33,13 @@ struct Pack {
 };
 
 // Instances and their weights, which sum to 1. `set_lobe_probabilities` fills in the lobe probabilities and `scale`.
-// The value of the blend is multiplied by `scale`, a factor for each colour channel.
+// The value of the blend is multiplied by `scale`, a factor for each colour channel. If `under_interface` is true, all
+// instances lie under `interface`, whose own reflection takes the place of the clearcoats.
 template <class T>
 struct Blend {
     int count = 0;
+    bool under_interface = false;
+    Interface<T> interface{T(0), T(0)};
     Pack<T> packs[MAX_PACKS];
     Vec3<T> scale;
 
@@ -80,17 +84,17 @@ struct Sample {
     T pdf;
 };
 
-// Fills in the lobe probabilities at cos(theta_i), in proportion to the estimated albedos of the lobes. If `bounded` is
-// true, also fills in `scale`, so that the blend reflects no more light than it receives.
-template <class T>
-inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded) {
-    const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
+// Fills in the lobe probabilities in proportion to the estimated albedos of the lobes, which `albedos_of` returns for
+// the instances of a pack. If `bounded` is true, also fills in `scale`, so that the blend reflects no more light than
+// it receives.
+template <class T, class Albedo>
+inline void share_out(Blend<T>& blend, bool bounded, const Albedo& albedos_of) {
     // Lanes 0 to 2 of `sum` hold the albedo of the blend in red, green and blue. Lane 3 holds the sum of these three
     // albedos, which is three times the sum of all probabilities before they are normalised.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
-        const Albedos<Lanes<T>> a = lobe_albedos<Lanes<T>>(pack.instances, cosine);
+        const Albedos<Lanes<T>> a = albedos_of(pack.instances);
         const Lanes<T> w = pack.weights;
         pack.probabilities = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
         const Vec3<Lanes<T>> albedo = (a.diffuse + a.clearcoat + a.spec) * w;
@@ -105,30 +109,63 @@ inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded)
     if (bounded) blend.scale = {inverse[0], inverse[1], inverse[2]};
 }
 
-// Copies each number of a `Geometry` to all lanes.
+// Fills in the lobe probabilities at cos(theta_i) and, if `bounded` is true, `scale`.
 template <class T>
-inline Geometry<Lanes<T>> spread(const Geometry<T>& g) {
-    const auto all = [](const Vec3<T>& v) { return Vec3<Lanes<T>>{v.x, v.y, v.z}; };
-    return {g.valid, all(g.wi), all(g.wo), all(g.h), g.cos_d, g.weight_i, g.weight_o, g.weight_d, g.clearcoat};
+inline void set_lobe_probabilities(Blend<T>& blend, T cos_theta_i, bool bounded) {
+    using Instances = Principled<Lanes<T>>;
+    const Lanes<T> cosine = cos_theta_i > MIN_COS<T> ? cos_theta_i : T(1);
+    if (!blend.under_interface)
+        return share_out(blend, bounded, [&](const Instances& p) { return lobe_albedos<Lanes<T>>(p, cosine); });
+    const Interface<Lanes<T>> interface{blend.interface.alpha, blend.interface.eta};
+    share_out(blend, bounded, [&](const Instances& p) { return lobe_albedos_below<Lanes<T>>(p, interface, cosine); });
 }
 
-// The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. The value and the density are 0 below the
-// horizon.
+// Copies each number of a vector or of a `Geometry` to all lanes.
 template <class T>
-inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
+inline Vec3<Lanes<T>> spread(const Vec3<T>& v) {
+    return {v.x, v.y, v.z};
+}
+template <class T>
+inline Geometry<Lanes<T>> spread(const Geometry<T>& g) {
+    return {g.valid, spread(g.wi), spread(g.wo), spread(g.h), g.cos_d, g.weight_i, g.weight_o, g.weight_d, g.clearcoat};
+}
+
+// Adds up the values and the densities of all lobes, which `lobes_of` returns for the instances of a pack.
+template <class T, class Lobe>
+inline Evaluation<T> added_up(const Blend<T>& blend, const Lobe& lobes_of) {
     Evaluation<T> result;
-    const Geometry<T> g = geometry<T>(wi, wo);
-    if (!g.valid) return result;
-    const Geometry<Lanes<T>> wide = spread(g);
     for (int n = 0; n < blend.used(); ++n) {
         const Pack<T>& pack = blend.packs[n];
-        const Lobes<Lanes<T>> lobes = eval_pdf_lobes<Lanes<T>>(pack.instances, wide);
+        const Lobes<Lanes<T>> lobes = lobes_of(pack.instances);
         result.value = result.value + sum(lobes.value * pack.weights);
         result.pdf += sum(pack.probabilities.diffuse * lobes.diffuse_pdf + pack.probabilities.spec * lobes.spec_pdf +
                           pack.probabilities.clearcoat * lobes.clearcoat_pdf);
     }
     result.value = result.value * blend.scale;
     return result;
+}
+
+// `eval_pdf` for a blend under an interface. All calls are inlined, because the compiler would pass the geometry and
+// the crossing to them in memory, which takes 5 ns.
+template <class T>
+NMA_WHOLE inline Evaluation<T> eval_pdf_below(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
+    const Geometry<T> g = geometry<T>(wi, wo);
+    if (!g.valid) return {};
+    const Geometry<Lanes<T>> wide = spread(g);
+    const Interface<Lanes<T>> interface{blend.interface.alpha, blend.interface.eta};
+    const Crossing<Lanes<T>> c = crossing<Lanes<T>>(interface, wide);
+    return added_up(blend, [&](const Principled<Lanes<T>>& p) { return eval_pdf_lobes_below<Lanes<T>>(p, wide, c); });
+}
+
+// The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. The value and the density are 0 below the
+// horizon.
+template <class T>
+inline Evaluation<T> eval_pdf(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
+    if (blend.under_interface) return eval_pdf_below(blend, wi, wo);
+    const Geometry<T> g = geometry<T>(wi, wo);
+    if (!g.valid) return {};
+    const Geometry<Lanes<T>> wide = spread(g);
+    return added_up(blend, [&](const Principled<Lanes<T>>& p) { return eval_pdf_lobes<Lanes<T>>(p, wide); });
 }
 
 // Returns the index of the instance whose interval contains the uniform number `u`. The intervals are consecutive and
@@ -141,26 +178,32 @@ inline int chosen(const Blend<T>& blend, Lanes<T> LobeProbabilities<Lanes<T>>::*
     return k;
 }
 
+// Draws a direction from three uniform numbers in [0, 1). If `wi` is below the horizon, returns the normal.
+template <class T>
+inline Vec3<T> draw(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1, T u2) {
+    if (!(wi.z > MIN_COS<T>)) return {T(0), T(0), T(1)};
+    // `u_lobe` chooses the lobe. Small values choose diffuse lobes, larger values specular lobes, and the largest
+    // values clearcoats, or the interface's own lobe.
+    T end = T(0);
+    for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].probabilities.diffuse);
+    if (u_lobe < end) return sample_diffuse<T>(u1, u2);
+    int k = chosen(blend, &LobeProbabilities<Lanes<T>>::spec, u_lobe, end);
+    if (k < blend.count) {
+        const Principled<Lanes<T>>& p = blend.packs[k / LANES].instances;
+        const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness[k % LANES], p.anisotropic[k % LANES]);
+        return blend.under_interface ? sample_below<T>(wi, blend.interface.eta, alpha_x, alpha_y, u1, u2)
+                                     : sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
+    }
+    if (blend.under_interface) return sample_spec<T>(wi, blend.interface.alpha, blend.interface.alpha, u1, u2);
+    k = std::min(chosen(blend, &LobeProbabilities<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);
+    const T gloss = blend.packs[k / LANES].instances.clearcoat_gloss[k % LANES];
+    return sample_clearcoat<T>(wi, clearcoat_alpha<T>(gloss), u1, u2);
+}
+
 // Draws a direction from three uniform numbers in [0, 1). Returns the direction with its value and its density.
 template <class T>
 inline Sample<T> sample(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1, T u2) {
-    if (!(wi.z > MIN_COS<T>)) return {{T(0), T(0), T(1)}, {T(0), T(0), T(0)}, T(0)};
-    // `u_lobe` chooses the lobe. Small values choose diffuse lobes, larger values specular lobes, and the largest
-    // values clearcoats.
-    T end = T(0);
-    for (int n = 0; n < blend.used(); ++n) end += sum(blend.packs[n].probabilities.diffuse);
-    Vec3<T> wo;
-    if (u_lobe < end) {
-        wo = sample_diffuse<T>(u1, u2);
-    } else if (int k = chosen(blend, &LobeProbabilities<Lanes<T>>::spec, u_lobe, end); k < blend.count) {
-        const Principled<Lanes<T>>& p = blend.packs[k / LANES].instances;
-        const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness[k % LANES], p.anisotropic[k % LANES]);
-        wo = sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
-    } else {
-        k = std::min(chosen(blend, &LobeProbabilities<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);
-        const T gloss = blend.packs[k / LANES].instances.clearcoat_gloss[k % LANES];
-        wo = sample_clearcoat<T>(wi, clearcoat_alpha<T>(gloss), u1, u2);
-    }
+    const Vec3<T> wo = draw(blend, wi, u_lobe, u1, u2);
     const Evaluation<T> found = eval_pdf(blend, wi, wo);
     return {wo, found.value, found.pdf};
 }

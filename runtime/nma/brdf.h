@@ -30,9 +30,11 @@ public:
     // of 0 marks an invalid direction.
     Sampled sample(const Direction& wi, float u_lobe, float u1, float u2) const {
         const Plane<float> plane = frame(wi);
-        Sampled found = nma::sample(blend_, plane_enter<float>(plane, wi), u_lobe, u1, u2);
-        found.wo = plane_leave<float>(plane, found.wo);
-        return found;
+        const Direction view = plane_enter<float>(plane, wi);
+        const Direction wo = plane_leave<float>(plane, draw(blend_, view, u_lobe, u1, u2));
+        // `eval_pdf` computes the same value for `wo`, because the direction is rounded before it enters the frame.
+        const Value found = nma::eval_pdf(blend_, view, plane_enter<float>(plane, wo));
+        return {wo, found.value, found.pdf};
     }
 
     // The directional albedo at `wi` as RGB, at most 1, for denoisers. The albedo is the mean of value / pdf over
