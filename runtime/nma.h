@@ -122,7 +122,8 @@ public:
             for (int q = 0; q < now; ++q) {
                 Brdf& made = brdfs[first + q];
                 made.in_plane_ = in_plane_;
-                kernels().decode(preparation_, outputs + q * network_.output_stride(), wi[first + q].z, made.blend_);
+                kernels().decode(preparation_, row(parameters, first + q), outputs + q * network_.output_stride(),
+                                 wi[first + q].z, made.blend_);
             }
             for (int q = first; q < first + now; ++q)
                 kernels().set_lobe_probabilities(preparation_, wi[q].z, brdfs[q].blend_);
@@ -177,11 +178,15 @@ private:
         preparation_.instances = weights_.instances;
         preparation_.outputs = static_cast<int>(places_.size()) * weights_.instances + weights_.instances - 1;
         preparation_.bounded = weights_.bounded;
+        preparation_.interface = weights_.interface.empty() ? nullptr : weights_.interface.data();
+        preparation_.material = material().empty() ? nullptr : material().data();
         // `check_description` compares the counts of inputs and outputs with the sizes of the layers, so it must
         // precede the changes to the layers below.
         check_description();
-        // Reorders the inputs of the first layer to the order in which `encode` writes them.
-        weights_.layers.front() = preparation_.encoding.arranged(weights_.layers.front());
+        // Reorders the inputs of the network to the order in which `encode` writes them, in all layers that read them.
+        weights_.layers.front().skipped = weights_.layers.front().in;
+        for (Layer& layer : weights_.layers)
+            if (layer.skipped) layer = preparation_.encoding.arranged(layer);
         network_ = Network(weights_.layers, options.set, options.compact);
         preparation_.network = network_.view();
         // `lay_out_ranges` and `lay_out_lanes` need the padded count of outputs, which `Network` has computed.
@@ -337,6 +342,8 @@ public:
         Brdf made;
         made.in_plane_ = nodes_[left].in_plane_;
         made.blend_.count = a.count;
+        made.blend_.under_interface = a.under_interface;
+        made.blend_.interface = a.interface;
         made.blend_.scale = a.scale + (b.scale - a.scale) * t[0];
         for (int n = 0; n < a.used(); ++n) {
             const Lanes<float>* from = a.packs[n].as_array();

@@ -318,7 +318,10 @@ class Adapter:
                 "direction; train again"
             )
         self._check_interface(path)
-        inputs = encoding.size(self.encoding, self.space, self.directional)
+        try:
+            inputs = encoding.size(self.encoding, self.space, self.directional)
+        except ValueError as e:
+            raise WeightsError(f"{path}: {e}; train again") from None
         found = self.layers[0][0].shape[1], self.layers[-1][0].shape[0]
         if found != (inputs, self.outputs):
             raise WeightsError(
@@ -327,18 +330,22 @@ class Adapter:
             )
 
     def _check_interface(self, path: Path) -> None:
-        """Raises `WeightsError` if the parameters of the interface are not two numbers of the class, or if the target
-        has parameters that need an interface, but the file names none."""
-        sizes = {param.name: param.size for param in self.space.params}
+        """Raises `WeightsError` if the parameters of the interface are not a width and an index of the class, or if the
+        target has parameters that need an interface, but the file names none."""
         if self.interface is None:
             if needs_interface(self.target):
                 raise WeightsError(
-                    f"{path}: the target lies under an interface, which the file does not name"
+                    f"{path}: the target lies under an interface, which the file does not name; train again"
                 )
-        elif [sizes.get(name) for name in self.interface] != [1, 1]:
+            return
+        lows = {param.name: param.low for param in self.space.params if param.size == 1}
+        if self.material is not None:
+            lows = {name: self.material[self.space.slices[name].start] for name in lows}
+        least = [lows.get(name, 0.0) for name in self.interface]
+        if not (len(least) == 2 and least[0] > 0.0 and least[1] >= 1.0):
             raise WeightsError(
-                f"{path}: the interface needs two numbers of the class {self.space.name}, got "
-                f"{shown(', '.join(map(str, self.interface)))}; train again"
+                f"{path}: the interface needs two parameters of the class {self.space.name}, a width above 0 and an "
+                f"index of at least 1, got {shown(', '.join(self.interface))}; train again"
             )
 
     def _check_material(self, path: Path) -> None:

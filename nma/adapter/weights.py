@@ -184,6 +184,10 @@ def _header(text: str) -> Header:
         raise WeightsError(
             f"the metadata field 'hidden' is not a list of whole numbers, {shown(header.hidden)}; train again"
         )
+    if any(type(name) is not str for name in header.interface):
+        raise WeightsError(
+            f"the metadata field 'interface' is not a list of names, {shown(header.interface)}; train again"
+        )
     return header
 
 

@@ -104,12 +104,13 @@ struct Kernels {
     void (*forward_many)(const NetworkView&, int queries, const float* inputs, int input_stride, float* outputs,
                          int output_stride);
     // `encode` fills in a row of inputs. `decode` computes a blend from `raw`, a row of outputs, and overwrites `raw`.
+    // From `parameters`, `decode` reads only the interface above the blend, if there is one.
     // `set_lobe_probabilities` then completes the blend: it fills in the lobe probabilities and, if the adapter is
     // bounded, the factor `scale`. `decode` uses wide vectors, and `set_lobe_probabilities` uses
     // narrow vectors. Some CPUs run narrow vector instructions at half the speed while wide vector instructions are
     // running. So `prepare_many` calls `decode` for all queries of a block before it calls `set_lobe_probabilities`.
     void (*encode)(const Preparation&, const float* parameters, const Vec3<float>& wi, float* inputs);
-    void (*decode)(const Preparation&, float* raw, float cosine, Blend<float>&);
+    void (*decode)(const Preparation&, const float* parameters, float* raw, float cosine, Blend<float>&);
     void (*set_lobe_probabilities)(const Preparation&, float cosine, Blend<float>&);
     // Runs all steps for one query.
     void (*prepare)(const Preparation&, const float* parameters, const Vec3<float>& wi, Blend<float>&);

@@ -45,14 +45,16 @@ public:
                         " layers, which this version cannot run");
         view_.depth = static_cast<int>(layers.size());
         const bool pairs = kernels_->set == InstructionSet::avx512_bf16 || compact;
-        int in = detail::padded(layers.front().in, INPUT_STEP);
+        const bool skip = layers.size() > 1 && layers.back().skipped > 0;
+        int in = detail::padded(layers.front().in, skip ? WIDTH_STEP : INPUT_STEP);
         for (std::size_t k = 0; k < layers.size(); ++k) {
             // The output layer gets at least one neuron of padding, because `Adapter::lay_out_lanes` (nma.h) needs an
             // output whose decoded value is 0. The decoded value of the padding is 0, because the padding has the range
             // 0 in `Ranges`.
             const bool last = k + 1 == layers.size();
             const int out = layers[k].out + (last ? 1 : 0);
-            if (layers[k].in > WIDEST_LAYER || out > WIDEST_LAYER)
+            if (last && skip) in += view_.layers[0].in;
+            if (in > WIDEST_LAYER || out > WIDEST_LAYER)
                 throw Error("the network is too wide: this version runs at most " + std::to_string(WIDEST_LAYER) +
                             " inputs, neurons in a hidden layer, and " + std::to_string(WIDEST_LAYER - 1) + " outputs");
             LayerView& view = view_.layers[k];
@@ -98,10 +100,16 @@ private:
         return to;
     }
 
+    // The column of input i of a layer. The inputs of the network, which are last in files, come first.
+    static int column(const Layer& layer, int i) {
+        const int neurons = layer.in - layer.skipped;
+        return i < neurons ? detail::padded(layer.skipped, WIDTH_STEP) + i : i - neurons;
+    }
+
     const float* keep_columns(const Layer& layer, const LayerView& view) {
         float* to = room(floats_, static_cast<std::size_t>(view.in) * view.width);
         for (int j = 0; j < layer.out; ++j)
-            for (int i = 0; i < layer.in; ++i) to[i * view.width + j] = layer.matrix[j * layer.in + i];
+            for (int i = 0; i < layer.in; ++i) to[column(layer, i) * view.width + j] = layer.matrix[j * layer.in + i];
         return to;
     }
 
@@ -120,8 +128,10 @@ private:
     const std::uint32_t* keep_pairs(const Layer& layer, const LayerView& view) {
         std::uint32_t* to = room(pairs_, static_cast<std::size_t>(view.in / 2) * view.width);
         for (int j = 0; j < layer.out; ++j)
-            for (int i = 0; i < layer.in; ++i)
-                to[i / 2 * view.width + j] |= detail::bfloat16(layer.matrix[j * layer.in + i]) << 16 * (i % 2);
+            for (int i = 0; i < layer.in; ++i) {
+                const int at = column(layer, i);
+                to[at / 2 * view.width + j] |= detail::bfloat16(layer.matrix[j * layer.in + i]) << 16 * (at % 2);
+            }
         return to;
     }
 

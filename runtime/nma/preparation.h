@@ -19,6 +19,11 @@ struct Preparation {
     // For each lane of each field of each pack, in the order of `Pack` in memory: the index of the decoded output that
     // the lane holds. A lane that holds no output has the index of an output of padding, whose value is 0.
     const int* outputs_of_lanes;
+    // The indices of the interface's width and index of refraction in the parameters; null if the target does not lie
+    // under an interface.
+    const int* interface;
+    // The parameters of the single material that the adapter was fitted to, or null.
+    const float* material;
 };
 
 // Reads the numbers of four lanes from memory by their indices. `LANES` is the count of lanes of `Lanes` and `Pack`,
@@ -34,21 +39,41 @@ struct Indexed {
     Lanes<float> operator()(const int* index) const {
         return {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
     }
+    // The same if the last two lanes hold no instance.
+    Lanes<float> pair(const int* index) const { return {numbers[index[0]], numbers[index[1]], 0.0f, 0.0f}; }
 };
 
-// Fills in the instances and the weights of a blend. `numbers` holds the decoded outputs. `pick` is an `Indexed` or a
-// `Few` that reads the same numbers.
+// Fills in all numbers of the instances of a pack. `read` reads the four numbers at an index of `outputs_of_lanes`.
+template <class Read>
+inline void fill_instances(Pack<float>& pack, const int* index, const Read& read) {
+    NMA_UNROLL for (int f = 0; f < Blend<float>::PRINCIPLED_SIZE; ++f) pack.as_array()[f] = read(index + f * LANES);
+}
+
+// Fills in the interface above a blend, if there is one. If the adapter was fitted to a single material, `parameters`
+// is not read.
+inline void set_interface(const Preparation& preparation, const float* parameters, Blend<float>& blend) {
+    const int* at = preparation.interface;
+    blend.under_interface = at != nullptr;
+    if (!at) return;
+    const float* row = preparation.material ? preparation.material : parameters;
+    blend.interface = {row[at[0]], row[at[1]]};
+}
+
+// Fills in the interface, the instances and the weights of a blend. `numbers` holds the decoded outputs. `pick` is an
+// `Indexed` or a `Few` that reads the same numbers.
 template <class Pick>
-inline void assemble(const Preparation& preparation, const float* numbers, const Pick& pick, Blend<float>& blend) {
+inline void assemble(const Preparation& preparation, const float* parameters, const float* numbers, const Pick& pick,
+                     Blend<float>& blend) {
     blend.count = preparation.instances;
     blend.scale = {1.0f, 1.0f, 1.0f};
-    const int* index = preparation.outputs_of_lanes;
+    set_interface(preparation, parameters, blend);
     const float* share = numbers + preparation.outputs - (blend.count - 1);
     float left = 1.0f;
     for (int n = 0; n < blend.used(); ++n) {
         Pack<float>& pack = blend.packs[n];
-        NMA_UNROLL for (int f = 0; f < Blend<float>::PRINCIPLED_SIZE; ++f, index += LANES) pack.as_array()[f] =
-            pick(index);
+        const int* index = preparation.outputs_of_lanes + n * Blend<float>::PRINCIPLED_SIZE * LANES;
+        if (blend.count <= 2) fill_instances(pack, index, [&](const int* k) { return pick.pair(k); });
+        else fill_instances(pack, index, pick);
         float weights[LANES] = {};
         NMA_UNROLL for (int k = 0; k < LANES; ++k) {
             const int next = n * LANES + k + 1;

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <fstream>
 #include <initializer_list>
+#include <limits>
 #include <tuple>
 
 #include "generated/constants.h"
@@ -16,10 +17,12 @@
 
 namespace nma {
 
-// A linear layer. `matrix` has `out` rows of `in` weights.
+// A linear layer. `matrix` has `out` rows of `in` weights. The last `skipped` inputs of the layer are the inputs of the
+// network; the other inputs are the neurons of the layer before.
 struct Layer {
     int in = 0, out = 0;
     std::vector<float> matrix, bias;
+    int skipped = 0;
 };
 
 // A target parameter: a field of `Principled` that the network sets, and the range of its decoded values.
@@ -65,6 +68,9 @@ struct Weights {
     // The parameters of the single material that the network was fitted to. The vector is empty if the network was
     // trained on a class, or if the class has no parameters.
     std::vector<float> material;
+    // The indices of two parameters: the width and the index of refraction of the interface under which the target
+    // lies. The vector is empty if the target does not lie under an interface.
+    std::vector<int> interface;
 };
 
 namespace detail {
@@ -152,7 +158,8 @@ inline std::vector<float> tensor(const std::vector<Place>& places, const char* d
     return values;
 }
 
-inline std::vector<Layer> layers(const std::vector<Place>& places, const char* data, int count) {
+// The layers of the network. If `skip` is true, the last of several layers reads the inputs of the network, too.
+inline std::vector<Layer> layers(const std::vector<Place>& places, const char* data, int count, bool skip) {
     std::vector<Layer> made;
     for (int k = 0; k < count; ++k) {
         const std::string name = "layer" + std::to_string(k);
@@ -160,8 +167,9 @@ inline std::vector<Layer> layers(const std::vector<Place>& places, const char* d
         Layer layer;
         layer.matrix = tensor(places, data, name + ".weight", 2, shape);
         layer.bias = tensor(places, data, name + ".bias", 1, length);
+        if (skip && k && k + 1 == count) layer.skipped = made.front().in;
         if (length[0] != shape[0] || !shape[0] || !shape[1] ||
-            (k && shape[1] != static_cast<std::uint64_t>(made.back().out)))
+            (k && shape[1] != static_cast<std::uint64_t>(made.back().out + layer.skipped)))
             throw Error("layer " + std::to_string(k) + " does not fit the layer before it");
         layer.out = static_cast<int>(shape[0]);
         layer.in = static_cast<int>(shape[1]);
@@ -293,6 +301,36 @@ inline std::vector<float> material(const Json& about, const Weights& made) {
     return found;
 }
 
+// The index of the parameter `name`, a single number, in an array of all parameters. Throws if the parameter does not
+// exist or may be less than `least`.
+inline int interface_column(const Weights& made, const std::string& name, double least) {
+    int column = 0;
+    for (const SourceParam& p : made.parameters) {
+        if (p.name == name && p.size == 1 && (made.material.empty() ? p.low : made.material[column]) >= least)
+            return column;
+        column += p.size;
+    }
+    throw Error("the interface needs a width above 0 and an index of at least 1, but '" + shown(name) +
+                "' is no such parameter; train again");
+}
+
+// The indices of the interface's width and index of refraction in an array of all parameters. The result is empty if
+// the target does not lie under an interface.
+inline std::vector<int> interface_columns(const Json& about, const Weights& made) {
+    std::vector<std::string> names;
+    if (about.find("interface"))
+        for (const Json& name : about.at("interface", Json::Kind::Array).items) names.push_back(name.string);
+    if (names.empty()) {
+        for (const TargetParam& p : made.target)
+            if (p.name == "veil" || p.name == "absorption")
+                throw Error("the target lies under an interface, which the file does not name; train again");
+        return {};
+    }
+    if (names.size() != 2) throw Error("the interface needs the names of two parameters; train again");
+    constexpr double TINY = std::numeric_limits<float>::min();
+    return {interface_column(made, names[0], TINY), interface_column(made, names[1], 1.0)};
+}
+
 inline Weights weights(const char* bytes, std::size_t size) {
     std::uint64_t length = 0;
     if (size < 8) throw Error("the file is too short for a weights file");
@@ -306,7 +344,7 @@ inline Weights weights(const char* bytes, std::size_t size) {
     if (!format.whole || format.number != FORMAT)
         throw Error("the file has a format that this version does not read; upgrade the runtime");
     only(about, {"class_name", "parameters", "encoding", "hidden", "instances", "directional", "reciprocal", "dialect",
-                 "target", "bounded", "training", "format"});
+                 "target", "bounded", "training", "format", "interface", "skip"});
     about.at("reciprocal", Json::Kind::Boolean);
     Weights made;
     made.class_name = about.at("class_name", Json::Kind::String).string;
@@ -318,12 +356,13 @@ inline Weights weights(const char* bytes, std::size_t size) {
         made.parameters.push_back(source_param(entry));
     made.target = target_params(about);
     made.material = material(about, made);
+    made.interface = interface_columns(about, made);
     made.instances = small(about, "instances", 64);
     const auto hidden = whole(about.at("hidden", Json::Kind::Array), WIDEST);
     if (hidden.size() >= DEEPEST) throw Error("the network has too many layers");
     const char* data = bytes + 8 + length;
-    made.layers =
-        layers(places(header, size - 8 - static_cast<std::size_t>(length)), data, static_cast<int>(hidden.size()) + 1);
+    made.layers = layers(places(header, size - 8 - static_cast<std::size_t>(length)), data,
+                         static_cast<int>(hidden.size()) + 1, flag(about, "skip"));
     for (std::size_t k = 0; k < hidden.size(); ++k)
         if (static_cast<std::uint64_t>(made.layers[k].out) != hidden[k])
             throw Error("the hidden layers do not have the widths in the metadata");

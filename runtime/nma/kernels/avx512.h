@@ -63,6 +63,7 @@ struct Few {
         std::memcpy(&found, &numbers, sizeof(found));
         return found;
     }
+    NMA_FN nma::Lanes<float> pair(const int* index) const { return (*this)(index); }
 };
 
 #include "body.inl"
@@ -100,14 +101,16 @@ NMA_OP void first_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
     }
 }
 // Computes a layer after the first. On entry, `y` holds the neurons of the previous layer. On return, `y` holds the
-// neurons of this layer.
-NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
+// neurons of this layer. `x` holds the inputs of the network, which the last layer may read.
+NMA_OP void next_layer(const LayerView& layer, const float* x, Vec (&y)[2]) {
     const Vec a = max(y[0], set(0.0f)), b = max(y[1], set(0.0f));
     const Vec blocks[] = {repeat<0>(a), repeat<1>(a), repeat<2>(a), repeat<3>(a),
                           repeat<0>(b), repeat<1>(b), repeat<2>(b), repeat<3>(b)};
     NMA_UNROLL for (int v = 0; v < 2; ++v) {
+        const float* column = layer.diagonals + v * layer.in * VEC_SIZE;
         Vec sums[4] = {load(layer.bias + v * VEC_SIZE), set(0.0f), set(0.0f), set(0.0f)};
-        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], layer.diagonals + (v * 8 + k) * 4 * VEC_SIZE);
+        for (int i = 0; i < layer.in - NARROW; i += 4, column += 4 * VEC_SIZE) add_block(sums, repeat(x + i), column);
+        NMA_UNROLL for (int k = 0; k < 8; ++k) add_block(sums, blocks[k], column + 4 * k * VEC_SIZE);
         y[v] = total(sums);
     }
 }
@@ -115,7 +118,7 @@ NMA_OP void next_layer(const LayerView& layer, Vec (&y)[2]) {
 // Computes all layers of a narrow network.
 NMA_OP void run_narrow(const NetworkView& view, const float* inputs, Vec (&y)[2]) {
     first_layer(view.layers[0], inputs, y);
-    for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], y);
+    for (int k = 1; k < view.depth; ++k) next_layer(view.layers[k], inputs, y);
 }
 
 // The function `forward` of `Kernels`, for networks of any width. For a narrow network, `run_narrow` keeps the
@@ -138,7 +141,7 @@ NMA_FN NMA_WHOLE inline void prepare_narrow(const Preparation& preparation, cons
         y[v] = decoded(preparation.ranges, v * VEC_SIZE, y[v], 1.0f - wi.z * wi.z);
         store(numbers + v * VEC_SIZE, y[v]);
     }
-    assemble(preparation, numbers, Few(y[0], y[1]), blend);
+    assemble(preparation, parameters, numbers, Few(y[0], y[1]), blend);
     nma::set_lobe_probabilities(blend, wi.z, preparation.bounded);
 }
 

@@ -65,25 +65,34 @@ NMA_OP void store_pairs(std::uint32_t* pairs, Vec v) {
     _mm256_store_si256(reinterpret_cast<__m256i*>(pairs), (__m256i)_mm512_cvtneps_pbh(v));
 }
 
+// Stores the inputs of QUERIES queries as pairs. `x` has a row of STRIDE pairs for each query.
+template <int QUERIES, int STRIDE>
+NMA_FN inline void store_inputs(const NetworkView& view, const float* inputs, int input_stride, std::uint32_t* x) {
+    const int count = view.layers[0].in;
+    for (int q = 0; q < QUERIES; ++q)
+        for (int i = 0; i < count; i += VEC_SIZE) {
+            const __mmask16 present = static_cast<__mmask16>(count - i >= VEC_SIZE ? 0xffff : (1 << (count - i)) - 1);
+            store_pairs(x + q * STRIDE + i / 2, _mm512_maskz_loadu_ps(present, inputs + q * input_stride + i));
+        }
+}
+
 template <int QUERIES>
 NMA_FN inline void run_layers(const NetworkView& view, const float* inputs, int input_stride, float* outputs,
                               int output_stride) {
     alignas(64) float y[QUERIES * WIDEST_LAYER];
     alignas(64) std::uint32_t x[QUERIES * WIDEST_LAYER / 2];
     constexpr int STRIDE = WIDEST_LAYER / 2;
-    for (int q = 0; q < QUERIES; ++q)
-        for (int i = 0; i < view.layers[0].in; i += VEC_SIZE) {
-            const int left = view.layers[0].in - i;
-            const __mmask16 present = static_cast<__mmask16>(left >= VEC_SIZE ? 0xffff : (1 << left) - 1);
-            store_pairs(x + q * STRIDE + i / 2, _mm512_maskz_loadu_ps(present, inputs + q * input_stride + i));
-        }
+    store_inputs<QUERIES, STRIDE>(view, inputs, input_stride, x);
     for (int k = 0; k < view.depth; ++k) {
         const LayerView& layer = view.layers[k];
         if (k + 1 == view.depth) return tiles<4, QUERIES>(layer, 0, x, STRIDE, outputs, output_stride);
         tiles<4, QUERIES>(layer, 0, x, STRIDE, y, layer.width);
+        // If the next layer reads the inputs of the network, too, they come before the neurons of this layer.
+        const int before = view.layers[k + 1].in - layer.width;
+        if (before) store_inputs<QUERIES, STRIDE>(view, inputs, input_stride, x);
         for (int q = 0; q < QUERIES; ++q)
             for (int j = 0; j < layer.width; j += VEC_SIZE)
-                store_pairs(x + q * STRIDE + j / 2,
+                store_pairs(x + q * STRIDE + (before + j) / 2,
                             avx512::max(avx512::load(y + q * layer.width + j), avx512::set(0.0f)));
     }
 }

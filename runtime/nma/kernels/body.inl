@@ -85,16 +85,23 @@ NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int 
 
 // Computes all layers of a network for QUERIES queries.
 template <int VECTORS, int QUERIES>
-NMA_FN inline void run_layers(const NetworkView& view, const float* x, int x_stride, float* outputs,
+NMA_FN inline void run_layers(const NetworkView& view, const float* inputs, int input_stride, float* outputs,
                               int output_stride) {
     alignas(64) float buffers[2][QUERIES * WIDEST_LAYER];
+    const float* x = inputs;
+    int x_stride = input_stride;
     for (int k = 0; k < view.depth; ++k) {
         const LayerView& layer = view.layers[k];
         const bool last = k + 1 == view.depth;
         float* y = last ? outputs : buffers[k % 2];
-        const int y_stride = last ? output_stride : layer.width;
-        if (layer.pairs) tiles<VECTORS, QUERIES, true>(layer, 0, x, x_stride, y, y_stride, !last);
-        else tiles<VECTORS, QUERIES, false>(layer, 0, x, x_stride, y, y_stride, !last);
+        const int y_stride = last ? output_stride : view.layers[k + 1].in;
+        // If the next layer reads the inputs of the network, too, they come before the neurons of this layer.
+        const int before = last ? 0 : y_stride - layer.width;
+        for (int i = 0; i < before; i += VEC_SIZE)
+            NMA_UNROLL for (int q = 0; q < QUERIES; ++q)
+                store(y + q * y_stride + i, load(inputs + q * input_stride + i));
+        if (layer.pairs) tiles<VECTORS, QUERIES, true>(layer, 0, x, x_stride, y + before, y_stride, !last);
+        else tiles<VECTORS, QUERIES, false>(layer, 0, x, x_stride, y + before, y_stride, !last);
         x = y;
         x_stride = y_stride;
     }
@@ -141,11 +148,12 @@ NMA_FN NMA_WHOLE inline void encode(const Preparation& preparation, const float*
 }
 
 // Decodes the raw outputs in place, and fills in the blend except for its lobe probabilities and its `scale`.
-NMA_FN NMA_WHOLE inline void decode(const Preparation& preparation, float* raw, float cosine, Blend<float>& blend) {
+NMA_FN NMA_WHOLE inline void decode(const Preparation& preparation, const float* parameters, float* raw, float cosine,
+                                    Blend<float>& blend) {
     for (int k = 0; k < preparation.ranges.count; k += VEC_SIZE)
         store(raw + k, decoded(preparation.ranges, k, load(raw + k), 1.0f - cosine * cosine));
-    if (preparation.ranges.count <= Few::MOST) assemble(preparation, raw, Few(raw), blend);
-    else assemble(preparation, raw, Indexed(raw), blend);
+    if (preparation.ranges.count <= Few::MOST) assemble(preparation, parameters, raw, Few(raw), blend);
+    else assemble(preparation, parameters, raw, Indexed(raw), blend);
 }
 
 // Fills in the lobe probabilities of a decoded blend. If the adapter is bounded, also fills in `scale`, the factor that
@@ -162,6 +170,6 @@ NMA_FN inline void prepare(const Preparation& preparation, const float* paramete
     alignas(64) float inputs[WIDEST_LAYER], numbers[WIDEST_LAYER];
     encode(preparation, parameters, wi, inputs);
     FORWARD(preparation.network, inputs, numbers);
-    decode(preparation, numbers, wi.z, blend);
+    decode(preparation, parameters, numbers, wi.z, blend);
     set_lobe_probabilities(preparation, wi.z, blend);
 }

@@ -53,6 +53,11 @@ constexpr int NARROW = 32;
 // inputs 4 b .. 4 b + 3 to the neurons 4 g .. 4 g + 3. Diagonal r of square (b, g) is stored in column 4 b + r of
 // `diagonals`, at the elements 4 g .. 4 g + 3. In memory, the elements 0 .. 15 of all columns come first, then the
 // elements 16 .. 31 of all columns, and so on.
+//
+// The last layer may read the inputs of the network, too. Its inputs are then the inputs of the network and, after
+// them, the neurons of the layer before, each with their padding. So `in` of the last layer exceeds `width` of the
+// layer before by the padded count of the network's inputs, which is then a multiple of WIDTH_STEP. The inputs come
+// first, because the CPU can multiply them while it still computes the neurons.
 struct LayerView {
     int in, width;
     const float* bias;
