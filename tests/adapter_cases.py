@@ -5,7 +5,7 @@ import numpy as np
 from nma import network, target
 from nma.adapter import Adapter, encoding
 from nma.params import LAYERED3, MEASURED
-from nma.target import ANISOTROPIC_PARAMS, PRINCIPLED_PARAMS
+from nma.target import ANISOTROPIC_PARAMS, INTERFACE_PARAMS, PRINCIPLED_PARAMS
 
 VARIANTS = {"single": (1, False), "blended": (2, False), "omega_i": (1, True), "blended + omega_i": (2, True)}
 
@@ -18,8 +18,10 @@ def random_adapter(
     seed=0,
     params=PRINCIPLED_PARAMS,
     space=LAYERED3,
+    skip=False,
+    **fields,
 ):
-    """Returns an untrained adapter.
+    """Returns an untrained adapter. With `skip`, the last layer reads the inputs of the network, too.
 
     The random weights are large enough that the outputs of the network vary over the class.
     """
@@ -30,9 +32,19 @@ def random_adapter(
         target.output_size(instances, params),
     ]
     layers = [(m, 0.3 * rng.standard_normal(b.shape).astype(np.float32)) for m, b in network.init(rng, sizes)]
-    layers[-1] = (10.0 * layers[-1][0], layers[-1][1])
+    matrix = 10.0 * layers[-1][0]
+    if skip:
+        more = 0.3 * rng.standard_normal((len(matrix), sizes[0]))
+        matrix = np.concatenate([matrix, more], axis=1, dtype=np.float32)
+    layers[-1] = (matrix, layers[-1][1])
     record = {"data": "none", "seed": seed}
-    return Adapter(space, name, layers, instances, directional, params, record)
+    return Adapter(space, name, layers, instances, directional, params, record, **fields)
+
+
+def random_interface_adapter(hidden="3x32", seed=0, bounded=True, instances=2):
+    """Returns an untrained adapter whose target lies under the coat, and whose last layer reads the inputs, too."""
+    about = {"name": "layered3_bounce", "params": INTERFACE_PARAMS, "interface": LAYERED3.interface}
+    return random_adapter(instances, hidden=hidden, seed=seed, bounded=bounded, skip=True, **about)
 
 
 def random_anisotropic_adapter(hidden="3x32", seed=0):

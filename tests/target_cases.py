@@ -3,7 +3,7 @@
 import numpy as np
 
 from nma.ops import Color, Vec3
-from nma.target import Blend, Principled
+from nma.target import Blend, Interface, Principled
 
 # Arguments of `jax.jit` for tests that spend most of their time on compiling. The options turn off slow passes of XLA's
 # compiler, above all the fusion of the target's operations into large kernels.
@@ -53,6 +53,18 @@ def random_blend(
     """Returns n blends of `n_instances` random instances. The weights of each blend are random and sum to one."""
     weights = rng.dirichlet(np.ones(n_instances), n).T
     return Blend(tuple(random_principled(rng, n, dialect, fades) for _ in range(n_instances)), tuple(weights))
+
+
+def below_interface(rng: np.random.Generator, blend: Blend) -> Blend:
+    """Returns the blends under random interfaces. The index of every tenth interface is 1, so that it does not
+    reflect."""
+    n = len(blend.weights[0])
+    eta = np.where(rng.random(n) < 0.1, 1.0, rng.uniform(1.0, 2.5, n))
+    instances = tuple(
+        p._replace(veil=rng.random(n), absorption=4.0 * rng.random(n) * (rng.random(n) < 0.8))
+        for p in blend.instances
+    )
+    return blend._replace(instances=instances, interface=Interface(10.0 ** rng.uniform(-3.0, 0.0, n), eta))
 
 
 def random_directions(rng: np.random.Generator, n: int) -> Vec3:

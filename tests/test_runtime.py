@@ -5,9 +5,10 @@ import re
 
 import numpy as np
 import pytest
+from adapter_cases import random_interface_adapter
 from density_cases import p_values
 from runtime_cases import PRINCIPLED_SIZE, built, facing, in_single_precision, pointer, rows
-from target_cases import random_blend, random_directions, stacked
+from target_cases import below_interface, random_blend, random_directions, stacked
 
 import nma
 from nma import network, target
@@ -26,20 +27,44 @@ def bridge(compiler, tmp_path_factory):
     return built(compiler, "runtime_bridge.cpp", tmp_path_factory.mktemp("runtime"))
 
 
+@pytest.fixture(scope="module", params=[*nma.shipped(), "interface"])
+def name(request, tmp_path_factory):
+    """Returns the name of a shipped adapter, or the path of an adapter whose target lies under an interface."""
+    if request.param != "interface":
+        return request.param
+    path = tmp_path_factory.mktemp("runtime") / "interface.safetensors"
+    random_interface_adapter().save(path)
+    return path
+
+
 def flat(blend):
     """Converts a blend to an array (n, columns): the fields of all instances, then the weights."""
     columns = [x for p in blend.instances for x in (*p.base_color, *p[1:])]
-    return np.ascontiguousarray(np.stack([*columns, *blend.weights], axis=-1))
+    return np.ascontiguousarray(np.stack(np.broadcast_arrays(*columns, *blend.weights), axis=-1))
 
 
-def cases(seed=0, count=2):
-    """Returns random blends, wi and wo. In half of the cases wo lies in the specular lobe of the first instance."""
+def interfaces_of(blend):
+    """Converts the interfaces of a blend to an array (n, 2), or to None if the blend has none."""
+    return blend.interface and np.stack(blend.interface, axis=-1)
+
+
+def optional(array):
+    return pointer(array) if array is not None else None
+
+
+def cases(seed=0, count=2, interface=False):
+    """Returns random blends, wi and wo. In half of the cases wo lies in the specular lobe of the first instance, or of
+    any instance and of the interface if the blends lie under an interface."""
     rng = np.random.default_rng(seed)
     blend, wi, wo = (
         random_blend(rng, CASES, count, fades=True),
         random_directions(rng, CASES),
         random_directions(rng, CASES),
     )
+    if interface:
+        blend = below_interface(rng, blend)
+        drawn = stacked(target.sample(blend, wi, *rng.random((3, CASES)))[0])
+        return blend, wi, Vec3(*np.where(rng.random(CASES) < 0.5, drawn, stacked(wo)))
     near, alpha = np.arange(CASES) % 2 == 0, blend.instances[0].roughness ** 2
     tilt = alpha * np.tan(0.5 * np.pi * 0.9 * rng.random(CASES))
     turn = 2.0 * np.pi * rng.random(CASES)
@@ -49,17 +74,19 @@ def cases(seed=0, count=2):
     return blend, wi, Vec3(*np.where(near, mirrored, stacked(wo)))
 
 
+@pytest.mark.parametrize("interface", [False, True])
 @pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 1e-4)])
-def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, bounded):
-    blend, wi, wo = cases()
+def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, bounded, interface):
+    blend, wi, wo = cases(interface=interface)
     # The runtime and the package get the same inputs, rounded to the precision of the runtime.
     numbers, i, o = (x.astype(dtype) for x in (flat(blend), rows(wi), rows(wo)))
+    above = interfaces_of(blend).astype(dtype) if interface else None
     found = np.zeros((CASES, 4), dtype)
     call = bridge.evaluate_float if dtype == np.float32 else bridge.evaluate_double
-    call(CASES, 2, bounded, *(pointer(x) for x in (numbers, i, o, found)))
+    call(CASES, 2, bounded, pointer(numbers), optional(above), *(pointer(x) for x in (i, o, found)))
     wide = [x.astype(np.float64).T for x in (numbers, i, o)]
-    exact = unflat(wide[0])
+    exact = unflat(wide[0], above)
     exact = target.bounded(exact, wide[1][2]) if bounded else exact
     value, pdf = target.eval_pdf(exact, Vec3(*wide[1]), Vec3(*wide[2]))
     wanted = np.stack([*value, pdf], axis=-1)
@@ -67,21 +94,23 @@ def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, 
     np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=1e-7)
 
 
-def unflat(columns):
-    """Inverts `flat`: makes a blend of two instances from the columns of the array."""
+def unflat(columns, interfaces=None):
+    """Inverts `flat` and `interfaces_of`: makes a blend of two instances from the columns of the arrays."""
     instances = []
     for k in range(2):
         p = columns[PRINCIPLED_SIZE * k : PRINCIPLED_SIZE * (k + 1)]
         instances.append(target.Principled(Vec3(*p[:3]), *p[3:]))
-    return target.Blend(tuple(instances), tuple(columns[2 * PRINCIPLED_SIZE :]))
+    interface = None if interfaces is None else target.Interface(*interfaces.astype(np.float64).T)
+    return target.Blend(tuple(instances), tuple(columns[2 * PRINCIPLED_SIZE :]), interface=interface)
 
 
-def test_samples_are_those_of_the_target(bridge):
-    blend, wi, _ = cases(1)
+@pytest.mark.parametrize("interface", [False, True])
+def test_samples_are_those_of_the_target(bridge, interface):
+    blend, wi, _ = cases(1, interface=interface)
     u = np.random.default_rng(2).random((CASES, 3))
     found = np.zeros((CASES, 7))
-    numbers, i = flat(blend), rows(wi)
-    bridge.sample_double(CASES, 2, *(pointer(x) for x in (numbers, i, u, found)))
+    numbers, above, i = flat(blend), interfaces_of(blend), rows(wi)
+    bridge.sample_double(CASES, 2, pointer(numbers), optional(above), *(pointer(x) for x in (i, u, found)))
     wo, value, pdf = target.sample(blend, wi, *u.T)
     np.testing.assert_allclose(found, np.stack([*wo, *value, pdf], axis=-1), rtol=1e-6, atol=1e-9)
 
@@ -99,7 +128,6 @@ def queries(seed):
 
 
 @pytest.mark.parametrize("compact", [False, True])
-@pytest.mark.parametrize("name", nma.shipped())
 def test_network_outputs_agree_on_every_instruction_set(name, compact):
     adapter = nma.Adapter.load(name)
     params, cosines = queries(3)
@@ -126,7 +154,6 @@ def test_network_outputs_agree_on_every_instruction_set(name, compact):
         assert np.abs(outputs - found["portable"]).max() < 1e-4
 
 
-@pytest.mark.parametrize("name", nma.shipped())
 def test_single_queries_and_batches_make_the_same_materials(name):
     params, cosines = queries(6)
     wi = facing(cosines)
@@ -142,14 +169,14 @@ def test_single_queries_and_batches_make_the_same_materials(name):
         np.testing.assert_allclose(many, each, rtol=tolerance, atol=1e-5)
 
 
-def test_an_adapter_evaluates_like_the_package():
-    adapter, rng = nma.Adapter.load("layered3-3x32"), np.random.default_rng(4)
+def test_an_adapter_evaluates_like_the_package(name):
+    adapter, rng = nma.Adapter.load(name), np.random.default_rng(4)
     params = nma.LAYERED3.sample(rng, CASES).astype(np.float32)
     wi, wo = (rows(random_directions(rng, CASES)).astype(np.float32) for _ in range(2))
     i, o = Vec3(*wi.T), Vec3(*wo.T)
     value, pdf = adapter.prepare(list(params.T), i).eval_pdf(i, o)
     for instruction_set in in_single_precision():
-        loaded = Runtime("layered3-3x32", instruction_set)
+        loaded = Runtime(name, instruction_set)
         found = np.column_stack(loaded.eval_pdf(loaded.prepare(params, wi.T[2]), wi, wo))
         # The errors of the network's outputs are about 1e-5. The values of a narrow lobe change much if an output
         # changes a little, so the relative errors of the values are larger.
@@ -178,7 +205,7 @@ def test_an_adapter_of_a_single_material_evaluates_like_the_package(tmp_path, hi
         np.testing.assert_allclose(found, np.stack([*value, pdf], axis=-1), rtol=2e-3, atol=1e-5)
 
 
-def test_curves_have_the_values_of_the_network():
+def test_curves_have_the_values_of_the_network(name):
     """Values from curves agree with values from the network: the median error is below 5e-4 of a value.
 
     The docstring of nma/render/curves.py states a mean error of about 1e-4 for curves with the same count of nodes.
@@ -186,7 +213,7 @@ def test_curves_have_the_values_of_the_network():
     params, cosines = queries(8)
     wi = facing(cosines)
     u = np.random.default_rng(9).random((CASES, 3), np.float32)
-    loaded = Runtime("layered3-5x64")
+    loaded = Runtime(name)
     library = loaded._c
     library.nma_curves_new.restype = ctypes.c_void_p
     for material in params[:5]:
@@ -218,11 +245,11 @@ def test_curves_at_nan_and_out_of_range_have_the_values_of_the_ends():
     np.testing.assert_array_equal(values, values[[0, 0, 0, 0, 4, 4, 4]])
 
 
-def test_samples_have_the_values_and_densities_of_eval():
+def test_samples_have_the_values_and_densities_of_eval(name):
     params, cosines = queries(10)
     wi = facing(cosines)
     u = np.random.default_rng(11).random((CASES, 3), np.float32)
-    loaded = Runtime("layered3-5x64")
+    loaded = Runtime(name)
     materials = loaded.prepare(params, cosines)
     wo, value, pdf = loaded.sample(materials, wi, u)
     valid = pdf > 0
@@ -234,7 +261,7 @@ def test_samples_have_the_values_and_densities_of_eval():
 
 
 @pytest.mark.slow
-def test_samples_follow_the_density():
+def test_samples_follow_the_density(name):
     """Samples of six materials follow their density (chi-square tests, false-alarm rate 1e-3 in all).
 
     The lobes in this test are not narrow. tests/test_target_sampling.py tests the package's sampling in double
@@ -245,7 +272,7 @@ def test_samples_follow_the_density():
     params, cosines = params[:tests], cosines[:tests]
     params[:, :2] = np.random.default_rng(13).uniform(0.1, 0.3, (tests, 2))
     wi = facing(cosines).astype(np.float32)
-    rng, loaded = np.random.default_rng(14), Runtime("layered3-5x64")
+    rng, loaded = np.random.default_rng(14), Runtime(name)
     materials = loaded.prepare(params, cosines)
     for k in range(tests):
 
@@ -262,11 +289,11 @@ def test_samples_follow_the_density():
         assert wrong < 1e-6
 
 
-def test_albedos_are_the_means_of_sample_weights_and_have_no_noise():
+def test_albedos_are_the_means_of_sample_weights_and_have_no_noise(name):
     params, cosines = queries(17)
     params, cosines, many = params[:10], np.linspace(0.02, 1.0, 10, dtype=np.float32), 1 << 15
     wi = facing(cosines)
-    loaded = Runtime("layered3-3x32")
+    loaded = Runtime(name)
     materials = loaded.prepare(params, cosines)
     found = loaded.albedo(materials, wi)
     np.testing.assert_array_equal(found, loaded.albedo(materials, wi))

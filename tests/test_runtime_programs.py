@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from adapter_cases import random_anisotropic_adapter
+from adapter_cases import random_anisotropic_adapter, random_interface_adapter
 
 ROOT = Path(__file__).parent.parent
 RUNTIME = ROOT / "runtime"
@@ -19,10 +19,11 @@ ARM, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64-static"
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """The paths of two shipped adapters and of an anisotropic adapter."""
-    path = tmp_path_factory.mktemp("weights") / "anisotropic.safetensors"
-    random_anisotropic_adapter().save(path)
-    return [*WEIGHTS, path]
+    """The paths of two shipped adapters, of an anisotropic adapter, and of one whose target lies under an interface."""
+    folder = tmp_path_factory.mktemp("weights")
+    random_anisotropic_adapter().save(folder / "anisotropic.safetensors")
+    random_interface_adapter().save(folder / "interface.safetensors")
+    return [*WEIGHTS, folder / "anisotropic.safetensors", folder / "interface.safetensors"]
 
 
 def tool(name):
@@ -159,7 +160,7 @@ def test_damaged_files_load_or_are_refused(weights, tmp_path):
     flags = ["-O0", "-fsanitize=address,undefined,float-divide-by-zero", "-fno-sanitize-recover=all"]
     program = built("g++", "tests/fuzz.cpp", tmp_path, *flags)
     total, loaded = (int(w) for w in output(program, 2000, *weights).split() if w.isdigit())
-    assert total == 6000
+    assert total == 8000
     assert 0 < loaded < total
 
 

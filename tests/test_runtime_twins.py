@@ -23,13 +23,15 @@ from nma.ops import Color, Vec3
 from nma.params import LAYERED3, LIBRARY, MEASURED
 from nma.render import curves
 from nma.target import Blend, Principled
-from nma.target.decode import TARGETS, decode, encode, output_size
+from nma.target.decode import TARGETS, decode, encode, needs_interface, output_size
 
 ROOT = Path(__file__).parent.parent
 CASES = 4000
 # Some encodings do not have the name of a class. CLASS_OF maps each of these encodings to the class whose parameters
 # the tests encode.
-CLASS_OF = {"direction": MEASURED, "azimuth": MEASURED, "raw": LIBRARY}
+CLASS_OF = {"direction": MEASURED, "azimuth": MEASURED, "raw": LIBRARY, "layered3_bounce": LAYERED3}
+# The encodings that always read the direction.
+DIRECTIONAL = (*encoding.ANISOTROPIC, "layered3_bounce")
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -43,8 +45,14 @@ def saved(folder, space, name, instances, directional, params, matrix, bias):
     """Saves an adapter with a single linear layer, and returns the path of its file."""
     layers = [(matrix.astype(np.float32), bias.astype(np.float32))]
     path = folder / "linear.safetensors"
-    nma.Adapter(space, name, layers, instances, directional, params).save(path)
+    interface = space.interface if needs_interface(params) else None
+    nma.Adapter(space, name, layers, instances, directional, params, interface=interface).save(path)
     return path
+
+
+def class_for(target, usual):
+    """Returns a class with an interface if the target needs one, or the class `usual`."""
+    return LAYERED3 if needs_interface(TARGETS[target]) else usual
 
 
 def class_of(name):
@@ -78,9 +86,11 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
     sigmoid rounds to its limit.
     """
     rng, size = np.random.default_rng(instances), output_size(instances, TARGETS[name])
-    matrix = rng.normal(size=(size, LIBRARY.size + 1)) * np.where(rng.random((size, 1)) < 0.1, 20.0, 0.5)
-    path = saved(tmp_path, LIBRARY, "raw", instances, True, TARGETS[name], matrix, rng.normal(size=size))
-    params, wi = drawn(LIBRARY, rng), views(rng)
+    space = class_for(name, LIBRARY)
+    matrix = rng.normal(size=(size, space.size + 1)) * np.where(rng.random((size, 1)) < 0.1, 20.0, 0.5)
+    path = saved(tmp_path, space, "raw", instances, True, TARGETS[name], matrix, rng.normal(size=size))
+    params, wi = drawn(space, rng), views(rng)
+    above = params[:, list(space.interface_columns)] if space.interface else np.zeros((CASES, 2), np.float32)
     for instruction_set in in_single_precision():
         runtime = Runtime(path, instruction_set)
         raw = runtime.outputs(params, wi).astype(np.float64)
@@ -88,8 +98,11 @@ def test_outputs_are_decoded_to_the_same_parameters(bridge, tmp_path, name, inst
         blend = decode(list(raw.T), instances, TARGETS[name], wi[:, 2].astype(np.float64))
         columns = [x for p in blend.instances for x in (*p.base_color, *p[1:])]
         wanted = np.stack([np.broadcast_to(x, CASES) for x in (*columns, *blend.weights)], axis=-1)
-        found = np.zeros(wanted.shape, np.float32)
-        bridge.brdf_numbers(CASES, instances, pointer(runtime.prepare(params, wi)), pointer(found))
+        found, interfaces = np.zeros(wanted.shape, np.float32), np.zeros((CASES, 2), np.float32)
+        brdfs = runtime.prepare(params, wi)
+        bridge.brdf_interfaces(CASES, pointer(brdfs), pointer(interfaces))
+        np.testing.assert_array_equal(interfaces, above)
+        bridge.brdf_numbers(CASES, instances, pointer(brdfs), pointer(found))
         # The error is relative to the largest number in the computation, which is the width of the range.
         error = np.abs(found - wanted) / (np.abs(wanted) + np.maximum(np.ptp(wanted, axis=0), 1.0))
         assert error.max() < 1e-6, instruction_set
@@ -103,10 +116,11 @@ def test_at_the_horizon_and_below_all_is_zero(tmp_path, name, bounded):
     tests/test_brdf.py tests the same rule in Python.
     """
     kind, rng = "azimuth" if name == "anisotropic" else "direction", np.random.default_rng(3)
-    size, inputs = output_size(2, TARGETS[name]), encoding.size(kind, MEASURED, True)
+    space = class_for(name, MEASURED)
+    size, inputs = output_size(2, TARGETS[name]), encoding.size(kind, space, True)
     path = saved(
         tmp_path,
-        MEASURED,
+        space,
         kind,
         2,
         True,
@@ -119,7 +133,7 @@ def test_at_the_horizon_and_below_all_is_zero(tmp_path, name, bounded):
     hidden, u = wi[:, 2] <= 0, rng.random((len(wi), 3))
     for instruction_set in in_single_precision():
         runtime = Runtime(path, instruction_set)
-        brdfs = runtime.prepare(np.zeros((len(wi), 0)), wi)
+        brdfs = runtime.prepare(np.tile(space.sample(rng, 1), (len(wi), 1)), wi)
         assert not np.any(np.column_stack(runtime.eval_pdf(brdfs, wi, wo)))
         sampled = np.column_stack(runtime.sample(brdfs, wi, u))
         assert np.isfinite(sampled).all() and not sampled[hidden, 3:].any()
@@ -129,8 +143,7 @@ def test_at_the_horizon_and_below_all_is_zero(tmp_path, name, bounded):
 
 @pytest.mark.parametrize(
     "name, directional",
-    # The outputs of an anisotropic adapter always depend on the direction.
-    [(name, d) for name in encoding.ENCODERS for d in (True, False) if d or name not in encoding.ANISOTROPIC],
+    [(name, d) for name in encoding.ENCODERS for d in (True, False) if d or name not in DIRECTIONAL],
 )
 def test_networks_have_the_same_inputs(tmp_path, name, directional):
     """Every encoding computes the same inputs of the network in C++ as in Python.

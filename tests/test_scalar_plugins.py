@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from adapter_cases import random_anisotropic_adapter
+from adapter_cases import random_anisotropic_adapter, random_interface_adapter
 from scalar_cases import CHECKS, MATERIAL, finished, plugins
 
 # Each test compiles the plugins or renders in processes of its own.
@@ -65,8 +65,11 @@ def agree(a, b):
     return (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4.5 * error + 1e-3 * b.mean(axis=0)).all()
 
 
-def test_scalar_and_vectorised_plugins_render_the_same():
+def test_scalar_and_vectorised_plugins_render_the_same(tmp_path):
+    random_interface_adapter("2x16").save(tmp_path / "interface.safetensors")
+    below = {"adapter": str(tmp_path / "interface.safetensors")}
     bsdfs = [{"type": kind, **material} for material in (MATERIAL, TEXTURED) for kind in ("nma", "layered")]
+    bsdfs += [{"type": "nma", **below, **material} for material in (MATERIAL, TEXTURED)]
     online = {"type": "nma", "online": True, "precision": "bfloat16", **MATERIAL}
     scalar = pictures("scalar_rgb", 32, *bsdfs, online)
     vectorised = pictures("llvm_ad_rgb", 128, *bsdfs)

@@ -62,6 +62,26 @@ KINDS = {
     "the class is a number": changed("layered3-3x32", class_name=3),
     "the target is an object": changed("layered3-3x32", target={}),
     "the training is a list": changed("layered3-3x32", training=[]),
+    "skip is 1": changed("layered3-3x32", skip=1),
+    "skip is null": changed("layered3-3x32", skip=None),
+    "the last layer does not read the inputs": changed("layered3-3x32", skip=True),
+    "the interface is null": changed("layered3-3x32", interface=None),
+    "the interface is text": changed("layered3-3x32", interface="alpha_top"),
+    "the interface is an object": changed("layered3-3x32", interface={"alpha_top": "eta_top"}),
+    "the interface has one name": changed("layered3-3x32", interface=["alpha_top"]),
+    "the interface has three names": changed("layered3-3x32", interface=["alpha_top", "eta_top", "sigma_t"]),
+    "the interface has numbers": changed("layered3-3x32", interface=[0, 2]),
+    "the interface has lists": changed("layered3-3x32", interface=[["alpha_top"], ["eta_top"]]),
+    "the interface has an unknown name": changed("layered3-3x32", interface=["alpha_top", "eta"]),
+    "the interface has a colour": changed("layered3-3x32", interface=["alpha_top", "eta_conductor"]),
+    "the interface has its names in the wrong order": changed(
+        "layered3-3x32", interface=["eta_top", "alpha_top"]
+    ),
+    "a width may be 0": changed("layered3-3x32", interface=["sigma_t", "eta_top"]),
+    "an interface is missing": ranged("target", 5, name="veil"),
+    "an encoding needs the direction": changed(
+        "layered3-3x32", encoding="layered3_bounce", directional=False
+    ),
     "a field of the target is unknown": ranged("target", 2, colour=1),
     "a field is unknown": changed("layered3-3x32", colour=1),
     "the format is missing": without("format"),
@@ -83,6 +103,22 @@ def test_both_readers_refuse_values_of_another_kind(tmp_path, fault):
     for reader in (Adapter.load, Runtime):
         with pytest.raises(WeightsError, match=re.escape(f"{path}: ")):
             reader(path)
+
+
+@pytest.mark.usefixtures("compiler")
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"interface": ["alpha_top", "eta_top"]},
+        {"interface": [], "skip": False},
+        {"encoding": "layered3_bounce", "interface": ["alpha_bottom", "eta_top"]},
+    ],
+)
+def test_both_readers_accept_an_interface_of_a_width_and_an_index(tmp_path, fields):
+    path = tmp_path / "good.safetensors"
+    path.write_bytes(changed("layered3-3x32", **fields))
+    assert (Adapter.load(path).interface or ()) == tuple(fields["interface"])
+    Runtime(path)
 
 
 @pytest.mark.usefixtures("compiler")
