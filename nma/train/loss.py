@@ -111,15 +111,23 @@ def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, 
     log_loss = (jnp.abs(residual) * batch.weight).mean()
     if recipe.loss == "log":
         return log_loss, log_loss
+    # `emphasis` adds the error of the value itself, with the weight `energy`. If log(1 + value) has the error d, the
+    # value has an error of about (1 + value) d.
+    emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
+    total = (_huber(mean, batch, 1.0) * emphasis * batch.weight).mean()
+    if recipe.dim > 0:
+        total = total + recipe.dim * (_huber(mean, batch, recipe.dim_floor) * batch.weight).mean()
+    return total, log_loss
+
+
+def _huber(mean: jax.Array, batch: Batch, floor: float) -> jax.Array:
+    """The Huber loss of the error of log(`floor` + value), quadratic within three standard errors of the table."""
+    residual = jnp.log(floor + mean) - jnp.log(floor + batch.value)
     # sigma is the standard error of the residual, from counting statistics. Each walk that ends in a bin adds `quantum`
     # to the bin's value, so a bin of mean value `expected` has about expected / quantum walks. One walk is added, so
     # that sigma is never 0.
     expected = jax.lax.stop_gradient(mean)
-    sigma = jnp.sqrt(batch.quantum * (expected + batch.quantum)) / (1.0 + expected)
+    sigma = jnp.sqrt(batch.quantum * (expected + batch.quantum)) / (floor + expected)
     width = 3.0 * sigma + _TOLERANCE
     size = jnp.abs(residual)
-    huber = jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)
-    # `emphasis` adds the error of the value itself, with the weight `energy`. If log(1 + value) has the error d, the
-    # value has an error of about (1 + value) d.
-    emphasis = 1.0 + recipe.energy * (1.0 + batch.value)
-    return (huber * emphasis * batch.weight).mean(), log_loss
+    return jnp.where(size < width, 0.5 * residual * residual / width, size - 0.5 * width)

@@ -40,6 +40,8 @@ class Recipe:
       not its median.
     - `energy`: weight of the error of the values themselves, which is added to the error of their logarithms. The
       larger `energy` is, the more bright bins count.
+    - `dim`: weight of the error of log(`dim_floor` + value), which sees relative errors in dim bins. eq. 7 hardly sees
+      them, because its logarithm is that of 1 + value.
     - `albedo`: weight of the squared error of the directional albedo, which is estimated from two times
       `albedo_samples` samples per row.
     - `schedule`: how the learning rate changes. "onecycle" rises to `learning_rate` and falls again. "plateau" starts
@@ -61,6 +63,8 @@ class Recipe:
     bins_law: Literal["mirror", "uniform"] = "mirror"
     loss: Literal["huber", "log"] = "huber"
     energy: float = 0.05
+    dim: float = 0.0
+    dim_floor: float = 0.02
     albedo: float = 1.0
     albedo_samples: int = 8
     schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
