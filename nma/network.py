@@ -61,7 +61,7 @@ def init(
     return layers
 
 
-def skip_width(layers: Layers) -> int:
+def skip_width(layers: Sequence[tuple[Any, Any]]) -> int:
     """The number of the network's inputs that the last layer reads, all or none of them."""
     return int(layers[-1][0].shape[1] - layers[-2][0].shape[0]) if len(layers) > 1 else 0
 

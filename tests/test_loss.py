@@ -130,6 +130,7 @@ def test_the_huber_loss_is_least_near_the_mean_of_noisy_bins_and_the_log_loss_at
         albedo=np.zeros((3, 4000), np.float32),
         albedo_shift=np.zeros((3, 2, 4000), np.float32),
         quantum=rows + np.float32(quantum),
+        interface=np.zeros((0, 4000), np.float32),
     )
     exact = float(means_of([(matrix, raw)], batch, base)[0, 0, 0])
     values = compound_poisson(rng, exact, quantum, (1, 4000))

@@ -49,10 +49,9 @@ class Oracle:
     def __init__(self, p: Principled):
         mi.set_variant("llvm_ad_rgb")
         self.side = int(np.sqrt(p.roughness.size))
-        scalars = {
-            k: v for k, v in p._asdict().items() if k not in ("base_color", "specular", "fade", "fade_width")
-        }
-        textures = {k: self.texture(v) for k, v in scalars.items()}
+        # Mitsuba's BSDF has none of the fields from `fade` on.
+        names = [k for k in p._fields[: p._fields.index("fade")] if k not in ("base_color", "specular")]
+        textures = {k: self.texture(getattr(p, k)) for k in names}
         self.bsdf = mi.load_dict(
             {
                 "type": "principled",

@@ -9,13 +9,13 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from target_cases import mapped, random_blend, random_directions, stacked
+from target_cases import below_interface, mapped, random_blend, random_directions, stacked
 
 from nma import ops, target
 from nma.llvm import ensure_llvm
 from nma.ops import Vec3
-from nma.target import Blend
 from nma.target.blend import lobe_probabilities
+from nma.target.interface import sample_below
 from nma.target.sampling import sample_clearcoat, sample_diffuse, sample_spec
 
 ensure_llvm()
@@ -62,15 +62,19 @@ def whole_chart(mirror):
 
 
 class Cases:
-    """Random blends of 1 to 5 instances, with one view direction each, as double-precision arrays."""
+    """Random blends of 1 to 5 instances, with one view direction each, as double-precision arrays.
 
-    def __init__(self, seed, n=N_BLENDS, dialect=True):
+    With `below`, the instances lie under interfaces.
+    """
+
+    def __init__(self, seed, n=N_BLENDS, dialect=True, below=False):
         rng = np.random.default_rng(seed)
         blend = random_blend(rng, n, 5, dialect)
+        blend = below_interface(rng, blend) if below else blend
         # A random count of instances, from 1 to 5, have a weight above 0.
         used = np.arange(5)[:, None] < rng.integers(1, 6, n)
         weights = np.where(used, stacked(blend.weights) + 1e-3, 0.0)
-        self.blend = Blend(blend.instances, tuple(weights / weights.sum(0)))
+        self.blend = blend._replace(weights=tuple(weights / weights.sum(0)))
         z = np.where(rng.random(n) < 0.15, 10.0 ** rng.uniform(-3, -1, n), rng.random(n))
         phi = rng.uniform(0, 2 * np.pi, n)
         self.wi = Vec3(np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z)
@@ -105,7 +109,7 @@ def draw(cases, count, seed, alpha_scale=1.0):
     def sampler(blend, wi, lane, u):
         rough = float(np.sqrt(alpha_scale))
         off = tuple(p._replace(roughness=p.roughness * rough) for p in blend.instances)
-        wo, _, pdf = target.sample(Blend(off, blend.weights), wi, *u)
+        wo, _, pdf = target.sample(blend._replace(instances=off), wi, *u)
         return wo, pdf > 0
 
     return drawn(cases, count, seed, sampler)
@@ -120,8 +124,15 @@ def draw_lobes(cases, count, seed):
     def sampler(blend, wi, lane, u):
         wo = sample_diffuse(u[1], u[2])
         for k, (alpha_x, alpha_y, alpha_c) in enumerate(target.lobe_alphas(blend)):
-            wo = ops.select(lane % 11 == 2 * k + 1, sample_spec(wi, alpha_x, alpha_y, u[1], u[2]), wo)
-            wo = ops.select(lane % 11 == 2 * k + 2, sample_clearcoat(wi, alpha_c, u[1], u[2]), wo)
+            if blend.interface is None:
+                spec = sample_spec(wi, alpha_x, alpha_y, u[1], u[2])
+                last = sample_clearcoat(wi, alpha_c, u[1], u[2])
+            else:
+                alpha, eta = blend.interface
+                spec = sample_below(wi, eta, alpha_x, alpha_y, u[1], u[2])
+                last = sample_spec(wi, alpha, alpha, u[1], u[2])
+            wo = ops.select(lane % 11 == 2 * k + 1, spec, wo)
+            wo = ops.select(lane % 11 == 2 * k + 2, last, wo)
         # Uniform directions replace samples below the horizon, because only samples above the horizon define bins.
         z = u[1]
         r = dr.sqrt(1.0 - z * z)
@@ -211,13 +222,14 @@ def integrate_adaptively(cases, boxes, tolerance=2e-6):
     raise AssertionError("the integral of the density does not converge; the density has a singularity")
 
 
-@pytest.fixture(scope="module")
-def bins():
+@pytest.fixture(scope="module", params=(False, True), ids=("plain", "below"))
+def bins(request):
     """Random blends, the cuts of their bins, and the probability that a sample lies in each bin (n, 2^DEPTH + 1).
 
-    The last column is the probability of an invalid sample.
+    The last column is the probability of an invalid sample. In the second half of the tests, the instances lie under
+    interfaces.
     """
-    cases = Cases(seed=31)
+    cases = Cases(seed=31, below=request.param)
     boxes, cuts = adaptive_bins(whole_chart(cases.mirror), *draw_lobes(cases, PILOT, seed=1))
     probability = integrate_adaptively(cases, boxes)
     invalid = 1.0 - probability.sum(1, keepdims=True)
@@ -261,8 +273,9 @@ def test_samples_follow_their_density(bins):
 def test_samples_with_alpha_off_by_five_per_cent_are_rejected(bins):
     p = p_values(bins, seed=3, alpha_scale=1.05)
     assert p.min() < SIDAK
-    # The test rejects more than half of the blends, so that the error is not found only by chance.
-    assert np.mean(p < SIDAK) > 0.5
+    # The test rejects more than half of the blends, so that the error is not found only by chance. Under an interface,
+    # fewer samples are drawn from the lobes whose widths are wrong.
+    assert np.mean(p < SIDAK) > (0.15 if bins[0].blend.interface else 0.5)
 
 
 def test_lobe_probabilities_follow_the_albedos():
@@ -280,15 +293,17 @@ def test_lobe_probabilities_follow_the_albedos():
     deviation = weight.std(1) / weight.mean(1)
     assert np.median(deviation) < 0.2
     assert deviation.max() < 0.7
-    total = sum(sum(p) for p in lobe_probabilities(cases.blend, cases.wi.z))
-    np.testing.assert_allclose(total, 1.0, rtol=1e-5)
 
 
-def test_sample_returns_the_value_and_pdf_of_eval_pdf():
+@pytest.mark.parametrize("below", (False, True), ids=("plain", "below"))
+def test_sample_returns_the_value_and_pdf_of_eval_pdf(below):
     rng = np.random.default_rng(33)
     blend, wi = random_blend(rng, 1000, 3), random_directions(rng, 1000)
+    blend = below_interface(rng, blend) if below else blend
     wo, value, pdf = target.sample(blend, wi, *rng.random((3, 1000)))
     again, density = target.eval_pdf(blend, wi, wo)
     np.testing.assert_array_equal(stacked(value), stacked(again))
     np.testing.assert_array_equal(pdf, density)
     assert np.all(pdf[wo.z < 0] == 0)
+    total = sum(sum(p) for p in lobe_probabilities(blend, wi.z))
+    np.testing.assert_allclose(total, 1.0, rtol=1e-5)

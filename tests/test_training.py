@@ -200,6 +200,7 @@ def test_the_plateau_schedule_halves_a_stalled_step():
         ({"loss": "l2"}, "loss is one of huber, log; got 'l2'"),
         ({"points_law": "random"}, "points_law is one of crowded, uniform, centre"),
         ({"target": "stretched", "directional": False}, "stretched .* depends on the direction"),
+        ({"target": "interface", "directional": False}, "stretched .* depends on the direction"),
         ({"bins_law": "lobes"}, "bins_law is one of mirror, uniform"),
         ({"schedule": "cosine"}, "schedule is one of onecycle, plateau, constant"),
     ],

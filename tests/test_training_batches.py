@@ -138,7 +138,12 @@ def test_a_training_that_fails_leaves_no_thread(monkeypatch):
     recipe = preset("single", steps=10**9)
     before = threading.active_count()
     with pytest.raises(ZeroDivisionError) as error:
-        loop.train(recipe, loop.Run(None), lambda step: Batch(*[np.ones(2)] * 13), progress=lambda run: 1 / 0)
+        loop.train(
+            recipe,
+            loop.Run(None),
+            lambda step: Batch(*[np.ones(2)] * len(Batch._fields)),
+            progress=lambda run: 1 / 0,
+        )
     assert error.value.__traceback__ and threading.active_count() == before
 
 

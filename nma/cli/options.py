@@ -135,6 +135,10 @@ Finest = Annotated[
 Loss = Annotated[
     str | None, choice("log: the paper's eq. 7. huber: quadratic within the noise of a bin.", *LOSSES)
 ]
+Dim = Annotated[
+    float | None,
+    number("Weight of the error of log(.02 + value), which sees dim bins; 0 turns it off.", 0, 1e6),
+]
 Albedo = Annotated[
     float | None, number("Weight of the error of the directional albedo; 0 turns it off.", 0, 1e6)
 ]

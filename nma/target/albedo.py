@@ -74,15 +74,16 @@ def interface_albedo(interface: Interface, cos: Float) -> Float:
     """The bound of the interface's own lobe: a bound of the masking, times the reflectance of a typical facet.
 
     The bound is closer than that of `spec_albedo`, because together with the light from below the interface, the lobe
-    often reflects nearly all light. Widths above .3 have the bound of .3.
+    often reflects nearly all light. Widths above .3 have the bound of .3, and indices below 1.05 that of 1.05.
     """
     alpha = ops.minimum(interface.alpha, 0.3)
     grazing = cos / alpha
     tilt = 0.37 * alpha / (alpha + 0.205)
     facet2 = ops.minimum(cos * cos + tilt * tilt / (1.0 + 0.2 * grazing), 1.0)
-    masked = 0.15 / (1.0 + 0.22 * grazing * grazing) + alpha * (0.87 - 1.7 * cos)
+    masked = 0.13 / (1.0 + 0.22 * grazing * grazing) + alpha * (0.87 - 1.7 * cos)
     unmasked = ops.minimum(1.0 - masked + 0.3 * ops.maximum(interface.eta - 2.0, 0.0), 1.0)
-    return dielectric_reflectance(ops.sqrt(facet2), facet2, interface.eta) * unmasked + INTERFACE_MARGIN
+    fresnel = dielectric_reflectance(ops.sqrt(facet2), facet2, ops.maximum(interface.eta, 1.05))
+    return fresnel * unmasked + INTERFACE_MARGIN
 
 
 def diffuse_albedo(p: Principled, cos: Float, weight: Float) -> Color:

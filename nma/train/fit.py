@@ -32,9 +32,7 @@ def recipe_for(source: Values | Tables, **changes: Any) -> Recipe:
     changes = {name: value for name, value in changes.items() if value is not None}
     if isinstance(source, Tables):
         grid = source.grid
-        suited: dict[str, Any] = {"encoding": "azimuth", "target": "anisotropic"} if grid.phi_i else {}
-        if source.space.interface:
-            suited = {"target": "interface"}
+        suited = {"encoding": "azimuth", "target": "anisotropic"} if grid.phi_i else {}
         return recipes.preset("single", grid=grid, **(suited | changes))
     return recipes.preset("measured" if source.isotropic else "anisotropic", **changes)
 
@@ -55,8 +53,6 @@ def fit(
     None` shows nothing. Raises `NmaError` if only the recipe or only the source is isotropic, and `TableError` if a
     table has several materials.
     """
-    if isinstance(source, Tables):
-        source = _without_class(source)
     recipe = recipe or recipe_for(source)
     with of_training(progress, recipe, "fitting") as show:
         if isinstance(source, Tables):
@@ -93,12 +89,8 @@ def _fit_table(
             f"a fit is for one material, but the table has {len(tables.values)} materials; choose one of them"
         )
     _check_isotropy("the table", not tables.grid.phi_i, recipe)
-    return train_class(MEASURED, recipe, tables, record, progress=progress, budget_seconds=budget_seconds)
-
-
-def _without_class(tables: Tables) -> Tables:
-    """The tables as those of materials of class "measured", which have no parameters."""
-    return Tables(tables.params[:, :0], tables.values, tables.walks, None, MEASURED.name)
+    unnamed = Tables(tables.params[:, :0], tables.values, tables.walks, None, MEASURED.name)
+    return train_class(MEASURED, recipe, unnamed, record, progress=progress, budget_seconds=budget_seconds)
 
 
 def _check_isotropy(name: str, isotropic: bool, recipe: Recipe) -> None:

@@ -52,7 +52,7 @@ class Recipe:
     network: str = "5x64"
     instances: int = 2
     directional: bool = True
-    target: Literal["principled", "stretched", "interface", "measured", "anisotropic"] = "interface"
+    target: Literal["principled", "stretched", "interface", "measured", "anisotropic"] = "principled"
     bounded: bool = True
     encoding: str = "layered3"
     rows: int = 512
@@ -117,7 +117,6 @@ CLASS = Recipe()
 
 # The paper's recipe (section 3.4), for comparison.
 PAPER = Recipe(
-    target="principled",
     bounded=False,
     encoding="raw",
     rows=1000,
@@ -192,12 +191,9 @@ def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
     """The preset `name` for a class, with `changes` as for `preset`.
 
     If the preset's encoding is named after a class, it is replaced by the encoding of the class `space` for the target,
-    or by `raw` if this class has no encoding. If the class has no interface, the target "interface" of a preset becomes
-    "stretched".
+    or by `raw` if this class has no encoding.
     """
     recipe = preset(name, **changes)
-    if space.interface is None and recipe.target == "interface" and changes.get("target") is None:
-        recipe = replace(recipe, target="stretched")
     if recipe.encoding not in sources.classes():
         return recipe
     return replace(recipe, encoding=encoding.of_class(space, under_interface=recipe.target == "interface"))

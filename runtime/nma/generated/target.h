@@ -465,9 +465,10 @@ inline T interface_albedo(const Interface<T>& interface, T cos) {
     const auto grazing = cos / alpha;
     const auto tilt = T(0.37) * alpha / (alpha + T(0.205));
     const auto facet2 = minimum(cos * cos + tilt * tilt / (T(1.0) + T(0.2) * grazing), T(1.0));
-    const auto masked = T(0.15) / (T(1.0) + T(0.22) * grazing * grazing) + alpha * (T(0.87) - T(1.7) * cos);
+    const auto masked = T(0.13) / (T(1.0) + T(0.22) * grazing * grazing) + alpha * (T(0.87) - T(1.7) * cos);
     const auto unmasked = minimum(T(1.0) - masked + T(0.3) * maximum(interface.eta - T(2.0), T(0.0)), T(1.0));
-    return dielectric_reflectance<T>(sqrt(facet2), facet2, interface.eta) * unmasked + INTERFACE_MARGIN<T>;
+    const auto fresnel = dielectric_reflectance<T>(sqrt(facet2), facet2, maximum(interface.eta, T(1.05)));
+    return fresnel * unmasked + INTERFACE_MARGIN<T>;
 }
 
 // The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
