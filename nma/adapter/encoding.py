@@ -52,6 +52,13 @@ def azimuth(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     return [2.0 * z - 1.0, x, y, x * x - y * y, 2.0 * x * y]
 
 
+def _scalars(alpha_top: Float, alpha_bottom: Float, eta_top: Float, sigma_t: Float) -> list[Float]:
+    """The parameters of `layered3` that are one number, each mapped to [0, 1]."""
+    names = ("alpha_top", "alpha_bottom", "eta_top", "sigma_t")
+    values = (alpha_top, alpha_bottom, eta_top, sigma_t)
+    return [LAYERED3[name].normalise(x) for name, x in zip(names, values, strict=True)]
+
+
 def layered3(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """Physical quantities of a coated conductor, all scaled to [-1, 1].
 
@@ -62,13 +69,7 @@ def layered3(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     """
     alpha_top, alpha_bottom, eta_top, *rest = columns
     eta, k, albedo, sigma_t = rest[0:3], rest[3:6], rest[6:9], rest[9]
-    ranged = (
-        ("alpha_top", alpha_top),
-        ("alpha_bottom", alpha_bottom),
-        ("eta_top", eta_top),
-        ("sigma_t", sigma_t),
-    )
-    unit = [LAYERED3[name].normalise(x) for name, x in ranged]
+    unit = _scalars(alpha_top, alpha_bottom, eta_top, sigma_t)
     for cosine in (1.0, GRAZING):
         unit += [fresnel_conductor(cosine, e / eta_top, x / eta_top) for e, x in zip(eta, k, strict=True)]
     unit += albedo
@@ -96,13 +97,7 @@ def layered3_bounce(columns: Sequence[Float], wi: Vec3 | None) -> list[Float]:
     eta = [e / eta_top for e in rest[0:3]]
     k = [x / eta_top for x in rest[3:6]]
     albedo, sigma_t = rest[6:9], rest[9]
-    ranged = (
-        ("alpha_top", alpha_top),
-        ("alpha_bottom", alpha_bottom),
-        ("eta_top", eta_top),
-        ("sigma_t", sigma_t),
-    )
-    unit = [LAYERED3[name].normalise(x) for name, x in ranged]
+    unit = _scalars(alpha_top, alpha_bottom, eta_top, sigma_t)
     unit += [fresnel_conductor(1.0, *index) for index in zip(eta, k, strict=True)]
     cos_theta_i = ops.maximum(wi.z, 0.0)
     fresnel, cos_t = fresnel_dielectric(cos_theta_i, eta_top)
