@@ -88,6 +88,14 @@ def test_training_lowers_the_loss_and_the_file_keeps_the_interface(tables, tmp_p
         np.testing.assert_allclose(a, b)
 
 
+def test_latent_codes_are_trained_without_the_interface_of_the_class(tables):
+    """The only column of a batch is the index of the material, and no column is taken for the interface."""
+    batch = draw(Pool.numbered(tables), BinSampler("uniform"), RECIPE, 0)
+    assert batch.interface.shape == (0, 64)
+    assert set(batch.columns[0]) <= set(range(8)) and len(batch.columns) == 1
+    assert draw(Pool.of(tables), BinSampler("uniform"), RECIPE, 0).interface.shape == (2, 64)
+
+
 def test_the_term_for_dim_bins_sees_relative_errors(tables):
     """A factor of 2 in dim bins hardly changes the loss of eq. 7, but the loss with the term for dim bins."""
     recipe = for_class(LAYERED3, rows=64)

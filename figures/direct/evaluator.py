@@ -9,7 +9,6 @@ a simple shape. The network is trained with the adapter's data, loss and optimis
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,7 +104,7 @@ def train(
     fresh = start(len(tables.params), how)
     begin = fresh if decoder is None else fresh._replace(decoder=decoder)
     run = loop.resume(how, begin, checkpoint, record)
-    pool, sampler = _numbered(tables), BinSampler(how.bins_law)
+    pool, sampler = Pool.numbered(tables), BinSampler(how.bins_law)
     objective = _objective if decoder is None else _latents_alone
     loop.train(
         how,
@@ -116,13 +115,6 @@ def train(
         progress=progress,
     )
     return loop.result(run, how), run
-
-
-def _numbered(tables: nma.Tables) -> Pool:
-    """Returns the tables as training data. Each material's only parameter is its index, which selects its latent
-    code."""
-    numbers = np.arange(len(tables.params), dtype=np.float64)[:, None]
-    return Pool.of(replace(tables, params=numbers))
 
 
 def _objective(evaluator: Evaluator, batch: Batch, how: Recipe) -> tuple[jax.Array, jax.Array]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Generator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import Empty, Queue
 from typing import Any, NamedTuple
 
@@ -65,6 +65,12 @@ class Pool:
         params = tables.params.astype(np.float32)
         columns = tables.space.interface_columns
         return Pool(params, tables.values, tables.walks, albedo, tables.grid, columns)
+
+    @staticmethod
+    def numbered(tables: Tables) -> Pool:
+        """Tables of materials whose only parameter is their index, as training of latent codes needs."""
+        numbers = np.arange(len(tables.values), dtype=np.float32)[:, None]
+        return replace(Pool.of(tables), params=numbers, interface=())
 
     def bins(self, m: NDArray, i: NDArray, a: NDArray, o: NDArray, p: NDArray) -> NDArray:
         """The values (..., 3) of some bins. Negative values become 0, because a BRDF is never negative."""

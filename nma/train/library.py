@@ -173,8 +173,7 @@ def _held(weights: Any, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Ar
 
 def _source(tables: Tables, recipe: Recipe) -> Callable[[int], Batch]:
     """A function that returns the batch of a step. The batch has one column: the index of each row's material."""
-    pool, sampler = Pool.of(tables), BinSampler(recipe.bins_law)
-    pool.params = np.arange(len(tables.values), dtype=np.float32)[:, None]
+    pool, sampler = Pool.numbered(tables), BinSampler(recipe.bins_law)
     return lambda step: draw(pool, sampler, recipe, step)
 
 
