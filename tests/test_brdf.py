@@ -160,13 +160,14 @@ def off(found, expected):
 
 @pytest.mark.parametrize("kind", IN_PLANE)
 def test_evaluating_a_blend_without_its_frame_is_wrong(kind):
-    """The values of a blend that is evaluated without its frame are more than 25 % off.
+    """The values of a blend that is evaluated without its frame are more than 40 % off, or 25 % under an interface,
+    whose own reflection has no axes.
 
     The large error shows that the other tests in this file would detect a BRDF that ignores its frame.
     """
     wi, wo = pairs()
     brdf = prepared(kind, wi)
-    assert off(target.eval(brdf.blend, wi, wo), brdf.eval(wi, wo)) > 0.25
+    assert off(target.eval(brdf.blend, wi, wo), brdf.eval(wi, wo)) > (0.25 if kind == "interface" else 0.4)
 
 
 def test_an_anisotropic_material_shows_its_azimuth():

@@ -293,6 +293,8 @@ def test_lobe_probabilities_follow_the_albedos():
     deviation = weight.std(1) / weight.mean(1)
     assert np.median(deviation) < 0.2
     assert deviation.max() < 0.7
+    total = sum(sum(p) for p in lobe_probabilities(cases.blend, cases.wi.z))
+    np.testing.assert_allclose(total, 1.0, rtol=1e-5)
 
 
 @pytest.mark.parametrize("below", (False, True), ids=("plain", "below"))

@@ -1,9 +1,13 @@
 """Training adapters whose target lies under the interface of their class."""
 
-import jax
 import numpy as np
 import pytest
 from target_cases import FAST_COMPILE
+
+pytest.importorskip("jax", reason="training needs JAX, the extra [train]", exc_type=ImportError)
+pytest.importorskip("optax", reason="training needs optax, the extra [train]", exc_type=ImportError)
+
+import jax
 
 import nma
 from nma import network, ops
@@ -37,7 +41,7 @@ def test_classes_without_an_interface_are_refused():
         initial_layers(recipe, MEASURED)
 
 
-def test_training_starts_at_the_estimates_of_a_single_bounce(tmp_path):
+def test_training_starts_at_the_estimates_of_a_single_bounce():
     """Before the first step, the first instance has the colour of light that is refracted, reflected by the conductor
     and refracted out, within the clipping of the estimates."""
     layers = initial_layers(RECIPE, LAYERED3)

@@ -187,8 +187,9 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
     if pool.grid.phi_i:
         phi = (a + rng.random(recipe.rows)) * (2.0 * np.pi / pool.grid.phi_i)
     f32 = np.float32
+    columns = np.ascontiguousarray(pool.params[m].T)
     return Batch(
-        np.ascontiguousarray(pool.params[m].T),
+        columns,
         mu.astype(f32),
         phi.astype(f32),
         i.astype(f32),
@@ -201,7 +202,7 @@ def draw(pool: Pool, sampler: BinSampler, recipe: Recipe, step: int) -> Batch:
         pool.albedo_at(m, i, a, mu).T.astype(f32),
         rng.random((3, 2, recipe.rows), dtype=f32),
         (pool.grid.rows / (pool.walks[m] * pool.grid.solid_angle)).astype(f32),
-        np.ascontiguousarray(pool.params[m][:, list(pool.interface)].T),
+        columns[list(pool.interface)],
     )
 
 
