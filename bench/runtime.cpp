@@ -1,10 +1,10 @@
 // Measures the C++ runtime, and prints one line of JSON for each measurement. bench/runtime.py compiles and runs
 // this program.
 //
-//     ./runtime NAME=WEIGHTS ...
+//     ./runtime [prepared] NAME=WEIGHTS ...
 //
-// Each measurement evaluates the same 240 random queries on one thread, many times. The result is the shortest time, in
-// nanoseconds per query.
+// With the word `prepared`, only the functions of prepared BRDFs are measured. Each measurement evaluates the same 240
+// random queries on one thread, many times. The result is the shortest time, in nanoseconds per query.
 #include "nma.h"
 
 #include <chrono>
@@ -18,7 +18,7 @@
 
 namespace {
 
-constexpr int QUERIES = 240, REPETITIONS = 100;
+constexpr int QUERIES = 240, REPETITIONS = 100, TURNS = 200;
 
 volatile float sink;
 
@@ -68,48 +68,80 @@ struct Queries {
     }
 };
 
-void time_adapter(const std::string& network, const std::string& path, nma::Options options) {
-    const nma::Adapter adapter = nma::Adapter::load(path, options);
-    const Queries queries(adapter);
-    const std::string label = std::string(nma::name(adapter.instruction_set())) + (options.compact ? " compact" : "");
-    const char* set = label.c_str();
-    const int stride = adapter.parameter_count();
-    std::vector<nma::Brdf> brdfs(QUERIES);
-    std::vector<float> outputs(static_cast<std::size_t>(QUERIES) * adapter.output_count());
-    report(network, "inputs and network", set, best([&] {
+// An adapter, and all that its measurements read and write.
+struct Subject {
+    std::string name;
+    nma::Adapter adapter;
+    Queries queries;
+    nma::Curves curves;
+    std::vector<nma::Brdf> brdfs;
+    std::vector<float> outputs;
+
+    Subject(const std::string& name, const std::string& path, const nma::Options& options)
+        : name(name),
+          adapter(nma::Adapter::load(path, options)),
+          queries(adapter),
+          curves(adapter, queries.parameters.data()),
+          brdfs(QUERIES),
+          outputs(static_cast<std::size_t>(QUERIES) * adapter.output_count()) {
+        adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), brdfs.data());
+    }
+    const float* row(int q) const { return &queries.parameters[q * adapter.parameter_count()]; }
+};
+
+// Reports the time of `work(subject)`, which evaluates every query once, for each subject. The subjects take turns, so
+// that other programs of the machine slow all of them alike.
+template <class F>
+void report_all(std::vector<Subject>& subjects, const char* what, const char* set, F work) {
+    std::vector<double> least(subjects.size(), 1e30);
+    for (int n = 0; n < TURNS; ++n)
+        for (std::size_t k = 0; k < subjects.size(); ++k)
+            least[k] = std::min(least[k], best([&] { work(subjects[k]); }, 2));
+    for (std::size_t k = 0; k < subjects.size(); ++k) report(subjects[k].name, what, set, least[k]);
+}
+
+void time_prepare(std::vector<Subject>& subjects, const char* set) {
+    report_all(subjects, "inputs and network", set, [](Subject& s) {
         alignas(64) float raw[nma::WIDEST_LAYER];
         for (int q = 0; q < QUERIES; ++q) {
-            adapter.network_outputs(&queries.parameters[q * stride], queries.cosines[q], raw);
+            s.adapter.network_outputs(s.row(q), s.queries.cosines[q], raw);
             sink = raw[0];
         }
-    }));
-    report(network, "prepare", set, best([&] {
+    });
+    report_all(subjects, "prepare", set, [](Subject& s) {
+        for (int q = 0; q < QUERIES; ++q) sink = s.adapter.prepare(s.row(q), s.queries.cosines[q]).blend().weight(0);
+    });
+    report_all(subjects, "inputs and network, batch", set, [](Subject& s) {
+        s.adapter.network_outputs_many(QUERIES, s.row(0), s.queries.cosines.data(), s.outputs.data());
+    });
+    report_all(subjects, "prepare, batch", set,
+               [](Subject& s) { s.adapter.prepare_many(QUERIES, s.row(0), s.queries.cosines.data(), s.brdfs.data()); });
+}
+
+// Measures the functions that depend only on the compiler's options, not on the instruction set of the network.
+void time_prepared(std::vector<Subject>& subjects, const char* set) {
+    report_all(subjects, "curves", set, [](Subject& s) {
+        for (int q = 0; q < QUERIES; ++q) sink = s.curves.at(s.queries.cosines[q]).blend().weight(0);
+    });
+    report_all(subjects, "eval and pdf", set, [](Subject& s) {
+        for (int q = 0; q < QUERIES; ++q) sink = s.brdfs[q].eval_pdf(s.queries.wi[q], s.queries.wo[q]).value.x;
+    });
+    report_all(subjects, "sample, eval and pdf", set, [](Subject& s) {
         for (int q = 0; q < QUERIES; ++q) {
-            const nma::Brdf made = adapter.prepare(&queries.parameters[q * stride], queries.cosines[q]);
-            sink = made.blend().weight(0);
+            const float* u = &s.queries.uniform[3 * q];
+            sink = s.brdfs[q].sample(s.queries.wi[q], u[0], u[1], u[2]).value.x;
         }
-    }));
-    report(network, "inputs and network, batch", set, best([&] {
-        adapter.network_outputs_many(QUERIES, queries.parameters.data(), queries.cosines.data(), outputs.data());
-    }));
-    report(network, "prepare, batch", set, best([&] {
-        adapter.prepare_many(QUERIES, queries.parameters.data(), queries.cosines.data(), brdfs.data());
-    }));
-    if (options.compact || options.set != nma::fastest()) return;
-    // The functions below do not depend on the instruction set, so they are measured only once.
-    const nma::Curves curves(adapter, queries.parameters.data());
-    report(network, "curves", "any", best([&] {
-        for (int q = 0; q < QUERIES; ++q) sink = curves.at(queries.cosines[q]).blend().weight(0);
-    }));
-    report(network, "eval and pdf", "any", best([&] {
-        for (int q = 0; q < QUERIES; ++q) sink = brdfs[q].eval_pdf(queries.wi[q], queries.wo[q]).value.x;
-    }));
-    report(network, "sample, eval and pdf", "any", best([&] {
-        for (int q = 0; q < QUERIES; ++q) {
-            const float* u = &queries.uniform[3 * q];
-            sink = brdfs[q].sample(queries.wi[q], u[0], u[1], u[2]).value.x;
-        }
-    }));
+    });
+}
+
+// Loads the adapters that the words NAME=WEIGHTS name.
+std::vector<Subject> subjects_of(const std::vector<std::string>& words, const nma::Options& options) {
+    std::vector<Subject> made;
+    for (const std::string& word : words) {
+        const std::size_t split = word.find('=');
+        made.emplace_back(word.substr(0, split), word.substr(split + 1), options);
+    }
+    return made;
 }
 
 // Measures a network without an adapter, first on one query at a time, then on all queries in one batch. All of the
@@ -196,8 +228,15 @@ NMA_TARGET("avx512f,fma") double peak_avx512() {
 
 }  // namespace
 
-int main(int count, char** words) {
+int main(int count, char** arguments) {
     using nma::InstructionSet;
+    std::vector<std::string> words(arguments + 1, arguments + count);
+    if (!words.empty() && words[0] == "prepared") {
+        words.erase(words.begin());
+        std::vector<Subject> subjects = subjects_of(words, {});
+        time_prepared(subjects, "any, plain");
+        return 0;
+    }
     if (nma::supported(InstructionSet::avx512)) report("", "peak multiply-adds per ns", "avx512", peak_avx512());
     const std::pair<const char*, std::vector<int>> networks[] = {{"5x64", {16, 64, 64, 64, 64, 64, 23}},
                                                                  {"3x32", {16, 32, 32, 32, 23}}};
@@ -209,14 +248,13 @@ int main(int count, char** words) {
         for (const bool compact : {false, true}) {
             if (rounds && !compact) continue;
             for (const auto& [name, sizes] : networks) time_network(name, sizes, set, compact);
-            for (int k = 1; k < count; ++k) {
-                const std::string word = words[k];
-                const std::size_t split = word.find('=');
-                time_adapter(word.substr(0, split), word.substr(split + 1), {set, compact});
-            }
+            std::vector<Subject> subjects = subjects_of(words, {set, compact});
+            time_prepare(subjects, (std::string(nma::name(set)) + (compact ? " compact" : "")).c_str());
         }
         time_network("1.07 M", large, set, rounds, 10);
     }
+    std::vector<Subject> subjects = subjects_of(words, {});
+    time_prepared(subjects, "any");
 #ifdef HAS_EIGEN
     for (const auto& [name, sizes] : networks) time_eigen(name, sizes);
 #endif

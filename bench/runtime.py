@@ -1,9 +1,12 @@
 """Times per query of the C++ runtime, by instruction set, compared with Eigen, NumPy, drjit.nn and a large decoder.
 
-python -m bench.runtime [--json OUT.json]
+python -m bench.runtime [ADAPTER ...] [--json OUT.json]
 
-Times are in nanoseconds on one thread. Each time is the shortest of many repetitions. Eigen is measured if its headers
-are installed (Debian: libeigen3-dev). The large decoder has 1.07 million parameters.
+The adapters are names of shipped ones or files; without any, all shipped ones are measured. Times are in nanoseconds on
+one thread. Each time is the shortest of many repetitions, in which the adapters take turns. Behind a time of the C++
+runtime stands its ratio to that of the first adapter. The code of prepared BRDFs is compiled for this CPU (`any`), and
+without options for a CPU (`any, plain`). Eigen is measured if its headers are installed (Debian: libeigen3-dev). The
+large decoder has 1.07 million parameters.
 """
 
 from __future__ import annotations
@@ -40,17 +43,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("adapters", nargs="*", metavar="ADAPTER", help="a shipped adapter or a weights file")
     parser.add_argument("--json", type=Path, help="also write all figures to this file")
     arguments = parser.parse_args()
     print(header(), flush=True)
-    rows = cpp() + [row for name in nma.shipped() for row in python(name)]
+    adapters = {label(name): name for name in arguments.adapters or nma.shipped()}
+    rows = cpp(adapters) + [row for name in adapters.items() for row in python(*name)]
     peak = next((r["ns"] for r in rows if r["what"].startswith("peak")), None)
     for title, what in (
         ("one query, ns", ("network", "inputs and network", "prepare")),
         ("per query of a batch, ns", ("network, batch", "inputs and network, batch", "prepare, batch")),
         ("once prepared, ns", ("curves", "eval and pdf", "sample, eval and pdf")),
     ):
-        table(title, what, rows)
+        table(title, what, rows, list(adapters))
     if peak:
         print(f"\nbatch in multiply-adds per ns; the core's peak in float32 is {peak:.1f}")
         for row in rows:
@@ -64,31 +69,44 @@ def main() -> None:
         )
 
 
-def cpp() -> list[dict]:
-    """Compiles and runs bench/runtime.cpp on this machine, and returns its measurements."""
+def label(name: str) -> str:
+    """Returns what the tables call an adapter: the name of its file, without that of the class."""
+    return Path(name).name.removesuffix(".safetensors").removeprefix("layered3-")
+
+
+def cpp(adapters: dict[str, str]) -> list[dict]:
+    """Compiles and runs bench/runtime.cpp on this machine, and returns its measurements of the labelled adapters."""
+    words = [f"{label}={weights_file(name)}" for label, name in adapters.items()]
+    eigen = [f"-isystem{EIGEN}"] if Path(EIGEN).exists() else []
+    return measured(["-march=native", *eigen], words) + measured([], ["prepared", *words])
+
+
+def measured(options: list[str], words: list[str]) -> list[dict]:
+    """Compiles bench/runtime.cpp with these options, runs it with these words, and returns what it prints."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "runtime"
-        flags = ["-std=c++17", "-O2", "-march=native", f"-I{build.sources()}"]
-        flags += [f"-isystem{EIGEN}"] if Path(EIGEN).exists() else []
+        flags = ["-std=c++17", "-O2", *options, f"-I{build.sources()}"]
         subprocess.run([build.compiler(), *flags, str(HERE / "runtime.cpp"), "-o", str(program)], check=True)
-        words = [f"{name.split('-')[1]}={weights_file(name)}" for name in nma.shipped()]
         run = subprocess.run([program, *words], capture_output=True, text=True, check=True)
     return [json.loads(line) for line in run.stdout.splitlines()]
 
 
-def python(name: str) -> list[dict]:
+def python(label: str, name: str) -> list[dict]:
     """Returns the times of an adapter's network in NumPy and in drjit.nn, on one thread."""
-    adapter = nma.Adapter.load(name)
-    label = name.split("-")[1]
-    layers = [(np.asarray(m, np.float32), np.asarray(b, np.float32)) for m, b in adapter.layers]
+    layers = [
+        (np.asarray(m, np.float32), np.asarray(b, np.float32)) for m, b in nma.Adapter.load(name).layers
+    ]
     size = layers[0][0].shape[1]
     rng = np.random.default_rng(0)
     one, many = rng.random((1, size), np.float32), rng.random((QUERIES, size), np.float32)
-    return [
+    rows = [
         row(label, "network", "NumPy", best(lambda: network.forward(layers, one), 200)),
         row(label, "network, batch", "NumPy", best(lambda: network.forward(layers, many), 5) / QUERIES),
-        row(label, "network, batch", "drjit.nn, float16", drjit_nn(layers, many)),
     ]
+    # `drjit.nn.Sequential` has no layers that read the inputs again.
+    if layers[-1][0].shape[1] == len(layers[-2][1]):
+        rows.append(row(label, "network, batch", "drjit.nn, float16", drjit_nn(layers, many)))
+    return rows
 
 
 def drjit_nn(layers: list, many: np.ndarray) -> float:
@@ -130,15 +148,21 @@ def row(network_name: str, what: str, by: str, seconds: float) -> dict:
     return {"network": network_name, "what": what, "set": by, "ns": round(1e9 * seconds, 2)}
 
 
-def table(title: str, what: tuple[str, ...], rows: list[dict]) -> None:
-    print(f"\n{title}\n  {'':7} {'':18} " + "".join(f"{w:>28}" for w in what))
-    keys = dict.fromkeys((r["network"], r["set"]) for r in rows if r["what"] in what)
-    for key in sorted(keys, key=lambda k: k[0]):
-        cells = {r["what"]: r["ns"] for r in rows if (r["network"], r["set"]) == key}
-        print(
-            f"  {key[0]:7} {key[1]:18} "
-            + "".join(f"{cells[w]:28.1f}" if w in cells else f"{'':28}" for w in what)
-        )
+def table(title: str, what: tuple[str, ...], rows: list[dict], adapters: list[str]) -> None:
+    """Prints the times `what` of all networks, and for adapters their ratios to the times of the first adapter."""
+    print(f"\n{title}\n  {'':16} {'':18} " + "".join(f"{w:>28}" for w in what))
+    times = {(r["network"], r["set"], r["what"]): r["ns"] for r in rows if r["what"] in what}
+    for name, by in sorted(dict.fromkeys(key[:2] for key in times), key=lambda key: key[0]):
+        usual = [times.get((adapters[0], by, w)) if name in adapters[1:] else None for w in what]
+        cells = [cell(times.get((name, by, w)), ns) for w, ns in zip(what, usual, strict=True)]
+        print(f"  {name:16} {by:18} " + "".join(f"{text:>28}" for text in cells))
+
+
+def cell(ns: float | None, usual: float | None) -> str:
+    """Returns a time as text, followed by its ratio to the time `usual`, if there is one."""
+    if ns is None:
+        return ""
+    return f"{ns:.1f} ({ns / usual:4.2f})" if usual else f"{ns:.1f}       "
 
 
 if __name__ == "__main__":

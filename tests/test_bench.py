@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import nma.render
-from bench import density, frames, samples, scenes, settings
+from bench import density, frames, runtime, samples, scenes, settings
 from nma.render.scene import CAMERAS
 
 ROOT = Path(__file__).parent.parent
@@ -25,6 +25,16 @@ OTHER = {"seconds": 1.0, "variance": 0.2, "error": None, "doubt": None}
 def bench(*words):
     command = [sys.executable, "-m", "bench", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=900, check=False)
+
+
+def test_adapters_are_called_by_their_names_without_the_class():
+    names = [
+        "layered3-3x32",
+        "layered3-principled-5x64",
+        "some/layered3-a.b.safetensors",
+        "other.safetensors",
+    ]
+    assert [runtime.label(name) for name in names] == ["3x32", "principled-5x64", "a.b", "other"]
 
 
 def test_efficiency_is_the_inverse_of_noise_times_time():
