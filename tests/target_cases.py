@@ -57,11 +57,12 @@ def random_blend(
 
 def below_interface(rng: np.random.Generator, blend: Blend) -> Blend:
     """Returns the blends under random interfaces. The index of every tenth interface is 1, so that it does not
-    reflect."""
+    reflect. Narrow lobes are not shifted: in single precision, the rounding of a shifted direction changes the flank of
+    a lobe of width .001 by .3 per cent."""
     n = len(blend.weights[0])
     eta = np.where(rng.random(n) < 0.1, 1.0, rng.uniform(1.0, 2.5, n))
     instances = tuple(
-        p._replace(veil=rng.random(n), absorption=4.0 * rng.random(n) * (rng.random(n) < 0.8))
+        p._replace(veil=rng.random(n), shift=rng.uniform(-0.6, 1.0, n) * (p.roughness > 0.15))
         for p in blend.instances
     )
     return blend._replace(instances=instances, interface=Interface(10.0 ** rng.uniform(-3.0, 0.0, n), eta))

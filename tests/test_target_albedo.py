@@ -77,7 +77,7 @@ def test_no_lobe_exceeds_its_bound(params):
     """The albedo of all lobes of an instance stays below the sum of their bounds, in each channel.
 
     The bounds are tight: their mean is less than .08 above the mean albedo. Under an interface, the bounds ignore the
-    light that is lost on the way out. So the tightness is tested without `veil` and `absorption`, and for indices up to
+    light that is lost on the way out. So the tightness is tested without `veil`, and for indices up to
     1.2, and the mean may be .15 above the mean albedo. A failure means that `bounded` may let a blend reflect more
     light than it receives, or that `bounded` dims blends too much.
     """
@@ -85,7 +85,7 @@ def test_no_lobe_exceeds_its_bound(params):
     found, error = estimate(blend, mu)
     assert (found - sum_of_bounds(blend, mu) < 4 * error).all()
     if blend.interface:
-        clear = blend.instances[0]._replace(veil=0.0 * mu, absorption=0.0 * mu)
+        clear = blend.instances[0]._replace(veil=0.0 * mu)
         weak = blend.interface._replace(eta=np.minimum(blend.interface.eta, 1.2))
         blend = blend._replace(instances=(clear,), interface=weak)
         found, error = estimate(blend, mu)

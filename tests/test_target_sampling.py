@@ -129,7 +129,7 @@ def draw_lobes(cases, count, seed):
                 last = sample_clearcoat(wi, alpha_c, u[1], u[2])
             else:
                 alpha, eta = blend.interface
-                spec = sample_below(wi, eta, alpha_x, alpha_y, u[1], u[2])
+                spec = sample_below(wi, eta, blend.instances[k].shift, alpha_x, alpha_y, u[1], u[2])
                 last = sample_spec(wi, alpha, alpha, u[1], u[2])
             wo = ops.select(lane % 11 == 2 * k + 1, spec, wo)
             wo = ops.select(lane % 11 == 2 * k + 2, last, wo)

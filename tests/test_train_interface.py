@@ -82,7 +82,7 @@ def test_training_lowers_the_loss_and_the_file_keeps_the_interface(tables, tmp_p
     adapter.save(tmp_path / "w.safetensors")
     again = Adapter.load(tmp_path / "w.safetensors")
     assert again.interface == ("alpha_top", "eta_top")
-    assert (again.outputs, again.size) == (25, 27)
+    assert (again.outputs, again.size) == (19, 21)
     assert network.skip_width(again.layers) == encoding.size("layered3_bounce", LAYERED3, True)
     wi = Vec3(0.6, 0.0, 0.8)
     columns = list(tables.params[0])

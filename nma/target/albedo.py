@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from nma import ops
 from nma.ops import Color, Float
-from nma.target.interface import Interface, cos_below
+from nma.target.interface import Interface, cos_below, cos_shifted
 from nma.target.principled import (
     CLEARCOAT_F0,
     CLEARCOAT_MASKING_ALPHA,
@@ -60,12 +60,13 @@ def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
 
 def lobe_albedos_below(p: Principled, interface: Interface, cos_theta_i: Float) -> Albedos:
     """The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
-    interface's own lobe. The bounds ignore `veil` and `absorption`, which only dim."""
-    weight = schlick_weight(cos_theta_i)
+    interface's own lobe. The bounds ignore the light that is lost on the way out."""
+    alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
     below = cos_below(cos_theta_i, interface.eta, 1.0 / interface.eta)
+    unmasked = unmasked_albedo(ops.minimum(alpha_x, alpha_y), cos_shifted(below, p.shift))
     return Albedos(
-        diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO,
-        spec_albedo(p, below) + MIN_ALBEDO,
+        p.base_color * (1.0 - p.metallic) + MIN_ALBEDO,
+        p.base_color * (p.metallic * unmasked) + (SPEC_MARGIN + MIN_ALBEDO),
         interface_albedo(interface, cos_theta_i),
     )
 
@@ -116,8 +117,12 @@ def spec_albedo(p: Principled, cos: Float) -> Color:
     facet2 = ops.minimum(cos * cos + tilt * tilt, 1.0)
     facet = ops.sqrt(facet2)
     fresnel = spec_fresnel(p, facet, facet2, schlick_weight(facet))
-    unmasked = ops.minimum(1.1 - alpha * (0.33 + 0.385 * cos), 1.0)
-    return (p.base_color * fresnel.colored + fresnel.white) * unmasked + SPEC_MARGIN
+    return (p.base_color * fresnel.colored + fresnel.white) * unmasked_albedo(alpha, cos) + SPEC_MARGIN
+
+
+def unmasked_albedo(alpha: Float, cos: Float) -> Float:
+    """The bound of the albedo of a specular lobe that reflects all light: its masking."""
+    return ops.minimum(1.1 - alpha * (0.33 + 0.385 * cos), 1.0)
 
 
 def clearcoat_albedo(p: Principled, cos: Float, weight: Float) -> Float:

@@ -103,22 +103,25 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
     spec_start = sum(p.diffuse for p in probabilities)
     clearcoat_start = spec_start + sum(p.spec for p in probabilities)
     (alpha_x, alpha_y, alpha_c), *others = lobe_alphas(blend)
+    shift, *shifts = (p.shift for p in blend.instances)
     spec_end = spec_start
     clearcoat_end = clearcoat_start
-    # Select the microfacet widths (alphas) of the instance to which the selected lobe belongs. Within the specular
-    # lobes and within the clearcoats, the intervals are in the order of the instances.
-    for p, (next_x, next_y, next_c) in zip(probabilities, others, strict=False):
+    # Select the microfacet widths (alphas) and the shift of the instance to which the selected lobe belongs. Within the
+    # specular lobes and within the clearcoats, the intervals are in the order of the instances.
+    for p, (next_x, next_y, next_c), next_shift in zip(probabilities, others, shifts, strict=False):
         spec_end = spec_end + p.spec
         clearcoat_end = clearcoat_end + p.clearcoat
         alpha_x = ops.select(u_lobe >= spec_end, next_x, alpha_x)
         alpha_y = ops.select(u_lobe >= spec_end, next_y, alpha_y)
         alpha_c = ops.select(u_lobe >= clearcoat_end, next_c, alpha_c)
+        if blend.interface is not None:
+            shift = ops.select(u_lobe >= spec_end, next_shift, shift)
     if blend.interface is None:
         spec = sample_spec(view, alpha_x, alpha_y, u1, u2)
         last = sample_clearcoat(view, alpha_c, u1, u2)
     else:
         alpha, eta = blend.interface
-        spec = sample_below(view, eta, alpha_x, alpha_y, u1, u2)
+        spec = sample_below(view, eta, shift, alpha_x, alpha_y, u1, u2)
         last = sample_spec(view, alpha, alpha, u1, u2)
     wo = ops.select(
         u_lobe < spec_start, sample_diffuse(u1, u2), ops.select(u_lobe < clearcoat_start, spec, last)
@@ -154,7 +157,7 @@ def lobes_of(blend: Blend, g: Geometry) -> list[Lobes]:
     if blend.interface is None:
         return [eval_pdf_lobes(p, g) for p in blend.instances]
     c = crossing(blend.interface, g)
-    return [eval_pdf_lobes_below(p, g, c) for p in blend.instances]
+    return [eval_pdf_lobes_below(p, c) for p in blend.instances]
 
 
 def lobe_alphas(blend: Blend) -> tuple[tuple[Float, Float, Float], ...]:

@@ -75,11 +75,12 @@ PRINCIPLED_PARAMS: tuple[TargetParam, ...] = (
 # plane.
 STRETCHED_PARAMS = (*PRINCIPLED_PARAMS, TargetParam("anisotropic", low=-6.0, high=0.95, in_plane=True))
 
-# Instances under an interface, whose width and index the class gives (`nma.target.interface`), have no clearcoat.
+# Instances under an interface, whose width and index the class gives (`nma.target.interface`).
 INTERFACE_PARAMS = (
-    *(p for p in STRETCHED_PARAMS if not p.name.startswith("clearcoat")),
+    *(p for p in STRETCHED_PARAMS if p.name in ("base_color", "roughness", "metallic", "anisotropic")),
+    TargetParam("flatness"),
     TargetParam("veil"),
-    TargetParam("absorption", high=4.0),
+    TargetParam("shift", low=-0.5, high=0.5),
 )
 
 # Measured materials need three more parameters. A fade is needed for RGL's measurements, for example. These
@@ -101,7 +102,7 @@ _LIMITS = {
     "anisotropic": (-1e6, 1.0),
     "fade": (-1.0, 1.0),
     "fade_width": (0.0, 1e6),
-    "absorption": (0.0, 1e3),
+    "shift": (-1.0, 1e3),
 }
 
 TARGETS = {
@@ -158,7 +159,7 @@ def _check(p: TargetParam) -> None:
 
 def needs_interface(params: Sequence[TargetParam]) -> bool:
     """Whether the parameters have a meaning only under an interface."""
-    return any(p.name in ("veil", "absorption") for p in params)
+    return any(p.name in ("veil", "shift") for p in params)
 
 
 def limits(field: str) -> tuple[float, float]:

@@ -1,17 +1,26 @@
 """Instances of the Principled BRDF that lie under the interface of a rough dielectric, such as a coat.
 
-The interface reflects light by one lobe of its own, whose width and index of refraction are known. The specular lobes
-of the instances lie under the interface: they are evaluated and sampled for the refracted directions. The diffuse lobes
-are evaluated for the directions above the interface, because scattering and refraction together leave little of the
-shape of a diffuse lobe. On their way out, all lobes of an instance are dimmed by two parameters that the network sets:
-`veil`, the share of the interface's inner reflection that is lost, and `absorption`, the optical depth below.
+The interface reflects light by one lobe of its own, whose width and index of refraction are known. Below it, each
+instance is simpler than a Principled BRDF above: a specular lobe and a diffuse lobe, both in the colour `base_color`,
+with the shares `metallic` and 1 - `metallic`. There is no Fresnel term, because the angles below are far from grazing,
+and no sheen.
 
-An instance that lies under an interface has no clearcoat of its own. Where code has three lobes per instance, the lobe
-of the interface takes the place of the clearcoat. The lobe is the same for all instances, whose weights sum to one.
+- The specular lobe is evaluated and sampled for the refracted directions. Because a rough interface bends light on
+  average more or less than a smooth interface does, `shift` moves the lobe: the slope of the refracted `wi` is
+  multiplied by 1 + `shift`.
+- The diffuse lobe is evaluated for the directions above the interface, because scattering and refraction together leave
+  little of the shape of a diffuse lobe. `flatness` blends it towards a lobe that sends almost as much light per solid
+  angle to grazing directions as to others, as light does that an interface has held back until its roughness lets the
+  light out.
+- `veil` dims both lobes on their way out. It is the share of the interface's inner reflection that is lost.
+
+Where code has three lobes per instance, the lobe of the interface takes the place of the clearcoat. The lobe is the
+same for all instances, whose weights sum to one.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from nma import ops
@@ -21,16 +30,15 @@ from nma.target.principled import (
     Lobes,
     Principled,
     dielectric_reflectance,
-    diffuse_terms,
     microfacet_lobe,
-    schlick_weight,
     spec_alpha,
-    spec_fresnel,
 )
 from nma.target.sampling import sample_spec
 
-# The function `exp` of the C++ runtime is exact for arguments of at least -87.
-_LEAST_EXPONENT = -87.0
+# The flat diffuse lobe is FLAT / (cos(theta_o) + FLAT_COSINE) times the diffuse lobe. FLAT makes the albedos of both
+# lobes equal.
+FLAT_COSINE = 0.15
+FLAT = 0.5 / (1.0 - FLAT_COSINE * math.log(1.0 + 1.0 / FLAT_COSINE))
 
 
 class Interface(NamedTuple):
@@ -45,11 +53,10 @@ class Crossing(NamedTuple):
 
     wi: Vec3  # the refracted directions, mirrored to point up
     wo: Vec3
-    cos_d: Float  # cosine between either of them and their half vector
-    weight_d: Float  # Schlick weight of `cos_d`
     jacobian: Float  # solid angle below the interface per solid angle of `wo`
     lost: Float  # the part of the light towards `wo` that the interface reflects back down
-    path: Float  # length of the way up along the refracted `wo`, in depths, minus 1
+    diffuse: Float  # values of the diffuse lobe and of the flat diffuse lobe, times cos(theta_o)
+    flat: Float
     value: Float  # the interface's own reflection, times cos(theta_o)
     pdf: Float  # the density with which the interface's own lobe samples `wo`
 
@@ -64,43 +71,61 @@ def refracted(v: Vec3, eta: Float, inverse: Float) -> Vec3:
     return Vec3(v.x * inverse, v.y * inverse, cos_below(v.z, eta, inverse))
 
 
+def stretch(sin2: Float, shift: Float) -> Float:
+    """The length of a unit vector after its horizontal part is multiplied by 1 + `shift`.
+
+    `sin2` is the squared length of the horizontal part. Without a shift, the result is exactly 1, so that narrow lobes
+    stay where they are.
+    """
+    return ops.sqrt(1.0 + shift * (2.0 + shift) * sin2)
+
+
+def shifted(wi: Vec3, shift: Float) -> Vec3:
+    """The direction `wi`, its slope multiplied by 1 + `shift`."""
+    inverse = 1.0 / stretch(wi.x * wi.x + wi.y * wi.y, shift)
+    factor = (1.0 + shift) * inverse
+    return Vec3(factor * wi.x, factor * wi.y, inverse * wi.z)
+
+
+def cos_shifted(cos: Float, shift: Float) -> Float:
+    """The cosine of a direction after `shifted`."""
+    return cos / stretch(1.0 - cos * cos, shift)
+
+
 def crossing(interface: Interface, g: Geometry) -> Crossing:
     """What an interface does with the directions of `g`."""
     eta = interface.eta
     inverse = 1.0 / eta
     wi = refracted(g.wi, eta, inverse)
     wo = refracted(g.wo, eta, inverse)
-    h = wi + wo
-    cos_d = 0.5 * ops.sqrt(ops.dot(h, h))
-    way = 1.0 / wo.z
-    jacobian = g.wo.z * inverse * inverse * way
+    jacobian = g.wo.z * inverse * inverse / wo.z
     lost = dielectric_reflectance(g.wo.z, g.wo.z * g.wo.z, eta)
+    diffuse = g.wo.z * ops.INV_PI
+    flat = diffuse * (FLAT / (g.wo.z + FLAT_COSINE))
     lobe, pdf = microfacet_lobe(g.wi, g.wo, interface.alpha, interface.alpha)
     value = lobe * dielectric_reflectance(g.cos_d, g.cos_d * g.cos_d, eta)
-    return Crossing(wi, wo, cos_d, schlick_weight(cos_d), jacobian, lost, way - 1.0, value, pdf)
+    return Crossing(wi, wo, jacobian, lost, diffuse, flat, value, pdf)
 
 
-def eval_pdf_lobes_below(p: Principled, g: Geometry, c: Crossing) -> Lobes:
+def eval_pdf_lobes_below(p: Principled, c: Crossing) -> Lobes:
     """The value of one instance under an interface, f cos(theta_o) [1/sr], and the densities of its lobes.
 
     The value contains the interface's own reflection, and `clearcoat_pdf` is the density of this reflection.
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    spec, spec_pdf = microfacet_lobe(c.wi, c.wo, alpha_x, alpha_y)
-    fresnel = spec_fresnel(p, c.cos_d, c.cos_d * c.cos_d, c.weight_d)
-    diffuse = diffuse_terms(p, g)
-    left = (1.0 - p.veil * c.lost) * ops.exp(ops.maximum(-p.absorption * c.path, _LEAST_EXPONENT))
-    density = c.jacobian * spec_pdf
-    value = c.jacobian * spec
-    colored = left * (diffuse.colored + value * fresnel.colored)
-    white = left * (diffuse.white + value * fresnel.white) + c.value
-    return Lobes(p.base_color * colored + white, g.wo.z * ops.INV_PI, density, c.pdf)
+    spec, spec_pdf = microfacet_lobe(shifted(c.wi, p.shift), c.wo, alpha_x, alpha_y)
+    diffuse = ops.lerp(c.diffuse, c.flat, p.flatness)
+    left = 1.0 - p.veil * c.lost
+    below = left * ops.lerp(diffuse, c.jacobian * spec, p.metallic)
+    return Lobes(p.base_color * below + c.value, c.diffuse, c.jacobian * spec_pdf, c.pdf)
 
 
-def sample_below(wi: Vec3, eta: Float, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float) -> Vec3:
+def sample_below(
+    wi: Vec3, eta: Float, shift: Float, alpha_x: Float, alpha_y: Float, u1: Float, u2: Float
+) -> Vec3:
     """A direction of a specular lobe under an interface. The direction points below the horizon where the interface
     reflects all light back down, or where the lobe itself leads down."""
-    o = sample_spec(refracted(wi, eta, 1.0 / eta), alpha_x, alpha_y, u1, u2)
+    o = sample_spec(shifted(refracted(wi, eta, 1.0 / eta), shift), alpha_x, alpha_y, u1, u2)
     cos2 = 1.0 - eta * eta * (1.0 - o.z * o.z)
     leaves = (o.z > 0.0) & (cos2 > 0.0)
     up = ops.sqrt(ops.select(leaves, cos2, 1.0))

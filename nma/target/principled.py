@@ -43,8 +43,8 @@ class Principled(NamedTuple):
     The first nine fields hold the paper's 11 numbers, each in [0, 1] (`specular` up to 1.6). `anisotropic` stretches
     the specular lobe along x, and `flatness` blends towards the fake subsurface of Burley 2015. The whole BRDF fades
     out where the half vector's cosine to the normal is less than about `fade`. The fade is a smooth step of the width
-    `fade_width`. With the default values of `fade` and `fade_width`, the BRDF does not fade. `veil` and `absorption`
-    dim an instance that lies under an interface, and only there have a meaning (`nma.target.interface`).
+    `fade_width`. With the default values of `fade` and `fade_width`, the BRDF does not fade. `veil` and `shift` have a
+    meaning only under an interface, where other fields have none (`nma.target.interface`).
     """
 
     base_color: Color
@@ -61,7 +61,7 @@ class Principled(NamedTuple):
     fade: Float = 0.0
     fade_width: Float = 0.0
     veil: Float = 0.0
-    absorption: Float = 0.0
+    shift: Float = 0.0
 
 
 class Geometry(NamedTuple):

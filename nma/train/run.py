@@ -37,11 +37,13 @@ _INITIAL = Blend(
     ),
     (0.6, 0.4),
 )
-# The same for instances under an interface: a metal, and what the layers between scatter.
+# The same for instances under an interface: a metal, and what the layers between scatter. Six fields have no meaning
+# under an interface.
+_UNUSED_BELOW = (0.0,) * 6
 _INITIAL_BELOW = Blend(
     (
-        Principled(Color(0.6, 0.6, 0.6), 0.35, 0.95, 0.5, 0.1, 0.05, 0.1, 0.0, 0.0, veil=0.9, absorption=0.1),
-        Principled(Color(0.4, 0.4, 0.4), 0.7, 0.3, 0.5, 0.1, 0.05, 0.1, 0.0, 0.0, veil=0.9, absorption=0.1),
+        Principled(Color(0.6, 0.6, 0.6), 0.35, 0.95, *_UNUSED_BELOW, flatness=0.2, veil=0.9),
+        Principled(Color(0.4, 0.4, 0.4), 0.7, 0.3, *_UNUSED_BELOW, flatness=0.2, veil=0.9),
     ),
     (0.8, 0.2),
 )

@@ -154,7 +154,7 @@ NMA_WHOLE inline Evaluation<T> eval_pdf_below(const Blend<T>& blend, const Vec3<
     const Geometry<Lanes<T>> wide = spread(g);
     const Interface<Lanes<T>> interface{blend.interface.alpha, blend.interface.eta};
     const Crossing<Lanes<T>> c = crossing<Lanes<T>>(interface, wide);
-    return added_up(blend, [&](const Principled<Lanes<T>>& p) { return eval_pdf_lobes_below<Lanes<T>>(p, wide, c); });
+    return added_up(blend, [&](const Principled<Lanes<T>>& p) { return eval_pdf_lobes_below<Lanes<T>>(p, c); });
 }
 
 // The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. The value and the density are 0 below the
@@ -191,8 +191,8 @@ inline Vec3<T> draw(const Blend<T>& blend, const Vec3<T>& wi, T u_lobe, T u1, T 
     if (k < blend.count) {
         const Principled<Lanes<T>>& p = blend.packs[k / LANES].instances;
         const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness[k % LANES], p.anisotropic[k % LANES]);
-        return blend.under_interface ? sample_below<T>(wi, blend.interface.eta, alpha_x, alpha_y, u1, u2)
-                                     : sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
+        if (!blend.under_interface) return sample_spec<T>(wi, alpha_x, alpha_y, u1, u2);
+        return sample_below<T>(wi, blend.interface.eta, p.shift[k % LANES], alpha_x, alpha_y, u1, u2);
     }
     if (blend.under_interface) return sample_spec<T>(wi, blend.interface.alpha, blend.interface.alpha, u1, u2);
     k = std::min(chosen(blend, &LobeProbabilities<Lanes<T>>::clearcoat, u_lobe, end), blend.count - 1);

@@ -322,7 +322,7 @@ inline std::vector<int> interface_columns(const Json& about, const Weights& made
         for (const Json& name : about.at("interface", Json::Kind::Array).items) names.push_back(name.string);
     if (names.empty()) {
         for (const TargetParam& p : made.target)
-            if (p.name == "veil" || p.name == "absorption")
+            if (p.name == "veil" || p.name == "shift")
                 throw Error("the target lies under an interface, which the file does not name; train again");
         return {};
     }

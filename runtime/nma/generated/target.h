@@ -14,7 +14,8 @@ template <class T> constexpr T CLEARCOAT_F0 = T(0.04);
 template <class T> constexpr T MIN_COS = T(1e-09);
 template <class T> constexpr T CLEARCOAT_MASKING_ALPHA = T(0.25);
 template <class T> constexpr T MIN_ALPHA = T(0.001);
-template <class T> constexpr T LEAST_EXPONENT = T(-87.0);
+template <class T> constexpr T FLAT = T(0.719975878135809);
+template <class T> constexpr T FLAT_COSINE = T(0.15);
 template <class T> constexpr T SHEEN_MARGIN = T(0.0005);
 template <class T> constexpr T W0 = T(0.047619047619047616);
 template <class T> constexpr T W1 = T(0.011904761904761904);
@@ -41,7 +42,7 @@ struct Principled {
     T fade;
     T fade_width;
     T veil;
-    T absorption;
+    T shift;
 };
 
 // Quantities of one pair of directions that all lobes of all instances use.
@@ -86,11 +87,10 @@ template <class T>
 struct Crossing {
     Vec3<T> wi;
     Vec3<T> wo;
-    T cos_d;
-    T weight_d;
     T jacobian;
     T lost;
-    T path;
+    T diffuse;
+    T flat;
     T value;
     T pdf;
 };
@@ -133,7 +133,7 @@ constexpr Field FIELDS[] = {
     {"fade", offsetof(Principled<float>, fade) / sizeof(float), 1, -1.0, 1.0},
     {"fade_width", offsetof(Principled<float>, fade_width) / sizeof(float), 1, 0.0, 1000000.0},
     {"veil", offsetof(Principled<float>, veil) / sizeof(float), 1, 0.0, 1.0},
-    {"absorption", offsetof(Principled<float>, absorption) / sizeof(float), 1, 0.0, 1000.0},
+    {"shift", offsetof(Principled<float>, shift) / sizeof(float), 1, -1.0, 1000.0},
 };
 
 // GGX distribution D(m) [1/sr]: the area of microfacets with normal `m` per solid angle and unit of surface area.
@@ -377,6 +377,26 @@ inline Vec3<T> refracted(const Vec3<T>& v, T eta, T inverse) {
     return Vec3<T>{v.x * inverse, v.y * inverse, cos_below<T>(v.z, eta, inverse)};
 }
 
+// The length of a unit vector after its horizontal part is multiplied by 1 + `shift`.
+template <class T>
+inline T stretch(T sin2, T shift) {
+    return sqrt(T(1.0) + shift * (T(2.0) + shift) * sin2);
+}
+
+// The direction `wi`, its slope multiplied by 1 + `shift`.
+template <class T>
+inline Vec3<T> shifted(const Vec3<T>& wi, T shift) {
+    const auto inverse = T(1.0) / stretch<T>(wi.x * wi.x + wi.y * wi.y, shift);
+    const auto factor = (T(1.0) + shift) * inverse;
+    return Vec3<T>{factor * wi.x, factor * wi.y, inverse * wi.z};
+}
+
+// The cosine of a direction after `shifted`.
+template <class T>
+inline T cos_shifted(T cos, T shift) {
+    return cos / stretch<T>(T(1.0) - cos * cos, shift);
+}
+
 // What an interface does with the directions of `g`.
 template <class T>
 inline Crossing<T> crossing(const Interface<T>& interface, const Geometry<T>& g) {
@@ -384,29 +404,24 @@ inline Crossing<T> crossing(const Interface<T>& interface, const Geometry<T>& g)
     const auto inverse = T(1.0) / eta;
     const auto wi = refracted<T>(g.wi, eta, inverse);
     const auto wo = refracted<T>(g.wo, eta, inverse);
-    const auto h = wi + wo;
-    const auto cos_d = T(0.5) * sqrt(dot(h, h));
-    const auto way = T(1.0) / wo.z;
-    const auto jacobian = g.wo.z * inverse * inverse * way;
+    const auto jacobian = g.wo.z * inverse * inverse / wo.z;
     const auto lost = dielectric_reflectance<T>(g.wo.z, g.wo.z * g.wo.z, eta);
+    const auto diffuse = g.wo.z * INV_PI<T>;
+    const auto flat = diffuse * (FLAT<T> / (g.wo.z + FLAT_COSINE<T>));
     const auto [lobe, pdf] = microfacet_lobe<T>(g.wi, g.wo, interface.alpha, interface.alpha);
     const auto value = lobe * dielectric_reflectance<T>(g.cos_d, g.cos_d * g.cos_d, eta);
-    return Crossing<T>{wi, wo, cos_d, schlick_weight<T>(cos_d), jacobian, lost, way - T(1.0), value, pdf};
+    return Crossing<T>{wi, wo, jacobian, lost, diffuse, flat, value, pdf};
 }
 
 // The value of one instance under an interface, f cos(theta_o) [1/sr], and the densities of its lobes.
 template <class T>
-inline Lobes<T> eval_pdf_lobes_below(const Principled<T>& p, const Geometry<T>& g, const Crossing<T>& c) {
+inline Lobes<T> eval_pdf_lobes_below(const Principled<T>& p, const Crossing<T>& c) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
-    const auto [spec, spec_pdf] = microfacet_lobe<T>(c.wi, c.wo, alpha_x, alpha_y);
-    const auto fresnel = spec_fresnel<T>(p, c.cos_d, c.cos_d * c.cos_d, c.weight_d);
-    const auto diffuse = diffuse_terms<T>(p, g);
-    const auto left = (T(1.0) - p.veil * c.lost) * exp(maximum(-p.absorption * c.path, LEAST_EXPONENT<T>));
-    const auto density = c.jacobian * spec_pdf;
-    const auto value = c.jacobian * spec;
-    const auto colored = left * (diffuse.colored + value * fresnel.colored);
-    const auto white = left * (diffuse.white + value * fresnel.white) + c.value;
-    return Lobes<T>{p.base_color * colored + white, g.wo.z * INV_PI<T>, density, c.pdf};
+    const auto [spec, spec_pdf] = microfacet_lobe<T>(shifted<T>(c.wi, p.shift), c.wo, alpha_x, alpha_y);
+    const auto diffuse = lerp(c.diffuse, c.flat, p.flatness);
+    const auto left = T(1.0) - p.veil * c.lost;
+    const auto below = left * lerp(diffuse, c.jacobian * spec, p.metallic);
+    return Lobes<T>{p.base_color * below + c.value, c.diffuse, c.jacobian * spec_pdf, c.pdf};
 }
 
 // The bound of the diffuse lobe: the closed-form integral of base and retro-reflection, plus a fitted formula for the
@@ -426,6 +441,12 @@ inline Vec3<T> diffuse_albedo(const Principled<T>& p, T cos, T weight) {
     return (p.base_color * base + tint * (p.sheen * sheen)) * (T(1.0) - p.metallic);
 }
 
+// The bound of the albedo of a specular lobe that reflects all light: its masking.
+template <class T>
+inline T unmasked_albedo(T alpha, T cos) {
+    return minimum(T(1.1) - alpha * (T(0.33) + T(0.385) * cos), T(1.0));
+}
+
 // The bound of the specular lobe (single scattering): a bound of the masking, times the Fresnel reflectance of a
 // typical facet.
 template <class T>
@@ -436,8 +457,7 @@ inline Vec3<T> spec_albedo(const Principled<T>& p, T cos) {
     const auto facet2 = minimum(cos * cos + tilt * tilt, T(1.0));
     const auto facet = sqrt(facet2);
     const auto fresnel = spec_fresnel<T>(p, facet, facet2, schlick_weight<T>(facet));
-    const auto unmasked = minimum(T(1.1) - alpha * (T(0.33) + T(0.385) * cos), T(1.0));
-    return (p.base_color * fresnel.colored + fresnel.white) * unmasked + SPEC_MARGIN<T>;
+    return (p.base_color * fresnel.colored + fresnel.white) * unmasked_albedo<T>(alpha, cos) + SPEC_MARGIN<T>;
 }
 
 // The bound of the clearcoat, which is treated as a mirror.
@@ -472,13 +492,15 @@ inline T interface_albedo(const Interface<T>& interface, T cos) {
 }
 
 // The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
-// interface's own lobe. The bounds ignore `veil` and `absorption`, which only dim.
+// interface's own lobe. The bounds ignore the light that is lost on the way out.
 template <class T>
 inline Albedos<T> lobe_albedos_below(const Principled<T>& p, const Interface<T>& interface, T cos_theta_i) {
-    const auto weight = schlick_weight<T>(cos_theta_i);
+    const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
     const auto below = cos_below<T>(cos_theta_i, interface.eta, T(1.0) / interface.eta);
-    return Albedos<T>{diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>,
-                      spec_albedo<T>(p, below) + MIN_ALBEDO<T>, interface_albedo<T>(interface, cos_theta_i)};
+    const auto unmasked = unmasked_albedo<T>(minimum(alpha_x, alpha_y), cos_shifted<T>(below, p.shift));
+    return Albedos<T>{p.base_color * (T(1.0) - p.metallic) + MIN_ALBEDO<T>,
+                      p.base_color * (p.metallic * unmasked) + (SPEC_MARGIN<T> + MIN_ALBEDO<T>),
+                      interface_albedo<T>(interface, cos_theta_i)};
 }
 
 // A direction with density cos(theta) / pi.
@@ -508,8 +530,8 @@ inline Vec3<T> sample_clearcoat(const Vec3<T>& wi, T alpha, T u1, T u2) {
 // A direction of a specular lobe under an interface. The direction points below the horizon where the interface
 // reflects all light back down, or where the lobe itself leads down.
 template <class T>
-inline Vec3<T> sample_below(const Vec3<T>& wi, T eta, T alpha_x, T alpha_y, T u1, T u2) {
-    const auto o = sample_spec<T>(refracted<T>(wi, eta, T(1.0) / eta), alpha_x, alpha_y, u1, u2);
+inline Vec3<T> sample_below(const Vec3<T>& wi, T eta, T shift, T alpha_x, T alpha_y, T u1, T u2) {
+    const auto o = sample_spec<T>(shifted<T>(refracted<T>(wi, eta, T(1.0) / eta), shift), alpha_x, alpha_y, u1, u2);
     const auto cos2 = T(1.0) - eta * eta * (T(1.0) - o.z * o.z);
     const auto leaves = o.z > T(0.0) && cos2 > T(0.0);
     const auto up = sqrt(select(leaves, cos2, T(1.0)));
