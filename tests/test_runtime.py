@@ -74,17 +74,18 @@ def cases(seed=0, count=2, interface=False):
     return blend, wi, Vec3(*np.where(near, mirrored, stacked(wo)))
 
 
-@pytest.mark.parametrize("interface", [False, True])
+# Under an interface, the runtime evaluates one or two instances by code of their own.
+@pytest.mark.parametrize("count, interface", [(2, False), (1, True), (2, True), (3, True)])
 @pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 1e-4)])
-def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, bounded, interface):
-    blend, wi, wo = cases(interface=interface)
+def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, bounded, count, interface):
+    blend, wi, wo = cases(count=count, interface=interface)
     # The runtime and the package get the same inputs, rounded to the precision of the runtime.
     numbers, i, o = (x.astype(dtype) for x in (flat(blend), rows(wi), rows(wo)))
     above = interfaces_of(blend).astype(dtype) if interface else None
     found = np.zeros((CASES, 4), dtype)
     call = bridge.evaluate_float if dtype == np.float32 else bridge.evaluate_double
-    call(CASES, 2, bounded, pointer(numbers), optional(above), *(pointer(x) for x in (i, o, found)))
+    call(CASES, count, bounded, pointer(numbers), optional(above), *(pointer(x) for x in (i, o, found)))
     wide = [x.astype(np.float64).T for x in (numbers, i, o)]
     exact = unflat(wide[0], above)
     exact = target.bounded(exact, wide[1][2]) if bounded else exact
@@ -95,13 +96,14 @@ def test_values_and_densities_are_those_of_the_target(bridge, dtype, tolerance, 
 
 
 def unflat(columns, interfaces=None):
-    """Inverts `flat` and `interfaces_of`: makes a blend of two instances from the columns of the arrays."""
+    """Inverts `flat` and `interfaces_of`: makes a blend from the columns of the arrays."""
     instances = []
-    for k in range(2):
+    count = len(columns) // (PRINCIPLED_SIZE + 1)
+    for k in range(count):
         p = columns[PRINCIPLED_SIZE * k : PRINCIPLED_SIZE * (k + 1)]
         instances.append(target.Principled(Vec3(*p[:3]), *p[3:]))
     interface = None if interfaces is None else target.Interface(*interfaces.astype(np.float64).T)
-    return target.Blend(tuple(instances), tuple(columns[2 * PRINCIPLED_SIZE :]), interface=interface)
+    return target.Blend(tuple(instances), tuple(columns[count * PRINCIPLED_SIZE :]), interface=interface)
 
 
 @pytest.mark.parametrize("interface", [False, True])

@@ -92,19 +92,32 @@ def cos_shifted(cos: Float, shift: Float) -> Float:
     return cos / stretch(1.0 - cos * cos, shift)
 
 
+def way_out(cos_o: Float, below: Float, inverse: Float) -> tuple[Float, Float, Float]:
+    """The fields `jacobian`, `diffuse` and `flat` of `Crossing`. `below` is the cosine of the refracted `wo`."""
+    jacobian = cos_o * inverse * inverse / below
+    diffuse = cos_o * ops.INV_PI
+    return jacobian, diffuse, diffuse * (FLAT / (cos_o + FLAT_COSINE))
+
+
 def crossing(interface: Interface, g: Geometry) -> Crossing:
     """What an interface does with the directions of `g`."""
     eta = interface.eta
     inverse = 1.0 / eta
     wi = refracted(g.wi, eta, inverse)
     wo = refracted(g.wo, eta, inverse)
-    jacobian = g.wo.z * inverse * inverse / wo.z
+    jacobian, diffuse, flat = way_out(g.wo.z, wo.z, inverse)
     lost = dielectric_reflectance(g.wo.z, g.wo.z * g.wo.z, eta)
-    diffuse = g.wo.z * ops.INV_PI
-    flat = diffuse * (FLAT / (g.wo.z + FLAT_COSINE))
     lobe, pdf = microfacet_lobe(g.wi, g.wo, interface.alpha, interface.alpha)
     value = lobe * dielectric_reflectance(g.cos_d, g.cos_d * g.cos_d, eta)
     return Crossing(wi, wo, jacobian, lost, diffuse, flat, value, pdf)
+
+
+def lobes_below(p: Principled, c: Crossing, spec: Float, spec_pdf: Float) -> Lobes:
+    """`eval_pdf_lobes_below`, given the `microfacet_lobe` of the refracted directions."""
+    diffuse = ops.lerp(c.diffuse, c.flat, p.flatness)
+    left = 1.0 - p.veil * c.lost
+    below = left * ops.lerp(diffuse, c.jacobian * spec, p.metallic)
+    return Lobes(p.base_color * below + c.value, c.diffuse, c.jacobian * spec_pdf, c.pdf)
 
 
 def eval_pdf_lobes_below(p: Principled, c: Crossing) -> Lobes:
@@ -114,10 +127,7 @@ def eval_pdf_lobes_below(p: Principled, c: Crossing) -> Lobes:
     """
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
     spec, spec_pdf = microfacet_lobe(shifted(c.wi, p.shift), c.wo, alpha_x, alpha_y)
-    diffuse = ops.lerp(c.diffuse, c.flat, p.flatness)
-    left = 1.0 - p.veil * c.lost
-    below = left * ops.lerp(diffuse, c.jacobian * spec, p.metallic)
-    return Lobes(p.base_color * below + c.value, c.diffuse, c.jacobian * spec_pdf, c.pdf)
+    return lobes_below(p, c, spec, spec_pdf)
 
 
 def sample_below(

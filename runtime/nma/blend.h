@@ -145,16 +145,39 @@ inline Evaluation<T> added_up(const Blend<T>& blend, const Lobe& lobes_of) {
     return result;
 }
 
+// The lobes of at most two instances under an interface: `crossing` and `eval_pdf_lobes_below` in one, with less work.
+// The lanes 0 and 1 compute the refracted `wi`, and the lobes of the instances. The lanes 2 and 3, which hold no
+// instance, compute the refracted `wo`, and the interface's own lobe.
+template <class T>
+inline Lobes<Lanes<T>> pair_below(const Interface<T>& interface, const Principled<Lanes<T>>& p, const Geometry<T>& g) {
+    using Four = Lanes<T>;
+    const Four alpha(interface.alpha), eta(interface.eta);
+    const T inverse = T(1) / interface.eta;
+    const Vec3<Four> wi = spread(g.wi), wo = spread(g.wo);
+    const Vec3<Four> below = refracted<Four>(halves(wi, wo), eta, inverse);
+    const auto [x, y] = spec_alpha<Four>(p.roughness, p.anisotropic);
+    const auto [spec, pdf] = microfacet_lobe<Four>(halves(shifted<Four>(below, p.shift), wi), halves(turned(below), wo),
+                                                   halves(x, alpha), halves(y, alpha));
+    // The reflectance of the interface's facets, and the part of the light that is lost.
+    const Four cosine = halves(Four(g.cos_d), wo.z);
+    const Four reflectance = dielectric_reflectance<Four>(cosine, cosine * cosine, eta);
+    const auto [jacobian, diffuse, flat] = way_out<T>(g.wo.z, below.z[2], inverse);
+    const Crossing<Four> c{wi, wo, jacobian, reflectance[2], diffuse, flat, spec[2] * reflectance[0], pdf[2]};
+    return lobes_below<Four>(p, c, spec, pdf);
+}
+
 // `eval_pdf` for a blend under an interface. All calls are inlined, because the compiler would pass the geometry and
 // the crossing to them in memory, which takes 5 ns.
 template <class T>
 NMA_WHOLE inline Evaluation<T> eval_pdf_below(const Blend<T>& blend, const Vec3<T>& wi, const Vec3<T>& wo) {
+    using Instances = Principled<Lanes<T>>;
     const Geometry<T> g = geometry<T>(wi, wo);
     if (!g.valid) return {};
+    if (blend.count <= 2) return added_up(blend, [&](const Instances& p) { return pair_below(blend.interface, p, g); });
     const Geometry<Lanes<T>> wide = spread(g);
     const Interface<Lanes<T>> interface{blend.interface.alpha, blend.interface.eta};
     const Crossing<Lanes<T>> c = crossing<Lanes<T>>(interface, wide);
-    return added_up(blend, [&](const Principled<Lanes<T>>& p) { return eval_pdf_lobes_below<Lanes<T>>(p, c); });
+    return added_up(blend, [&](const Instances& p) { return eval_pdf_lobes_below<Lanes<T>>(p, c); });
 }
 
 // The value f cos(theta_o) [1/sr] and the density of `sample` [1/sr]. The value and the density are 0 below the

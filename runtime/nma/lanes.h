@@ -171,6 +171,16 @@ template <class T> inline Lanes<T> log(const Lanes<T>& a) { return detail::logar
 template <class T> inline Lanes<T> exp(const Lanes<T>& a) { return detail::exponentials(a.v); }
 template <class T> inline Lanes<T> safe_sqrt(const Lanes<T>& a) { return sqrt(maximum(a, Lanes<T>(T(0)))); }
 
+// The lanes 0 and 1 of `a` and the lanes 2 and 3 of `b`, and the lanes of `a` with both halves exchanged.
+template <class T> inline Lanes<T> halves(const Lanes<T>& a, const Lanes<T>& b) { return {a[0], a[1], b[2], b[3]}; }
+template <class T> inline Lanes<T> turned(const Lanes<T>& a) { return {a[2], a[3], a[0], a[1]}; }
+template <class T> inline Vec3<Lanes<T>> halves(const Vec3<Lanes<T>>& a, const Vec3<Lanes<T>>& b) {
+    return {halves(a.x, b.x), halves(a.y, b.y), halves(a.z, b.z)};
+}
+template <class T> inline Vec3<Lanes<T>> turned(const Vec3<Lanes<T>>& a) {
+    return {turned(a.x), turned(a.y), turned(a.z)};
+}
+
 template <class T> inline T sum(const Lanes<T>& a) { return (a[0] + a[1]) + (a[2] + a[3]); }
 // A vector of four numbers: the sums of the lanes of a, b, c and d.
 template <class T> inline Lanes<T> sums(const Lanes<T>& a, const Lanes<T>& b, const Lanes<T>& c, const Lanes<T>& d) {

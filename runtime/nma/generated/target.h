@@ -397,6 +397,14 @@ inline T cos_shifted(T cos, T shift) {
     return cos / stretch<T>(T(1.0) - cos * cos, shift);
 }
 
+// The fields `jacobian`, `diffuse` and `flat` of `Crossing`. `below` is the cosine of the refracted `wo`.
+template <class T>
+inline std::tuple<T, T, T> way_out(T cos_o, T below, T inverse) {
+    const auto jacobian = cos_o * inverse * inverse / below;
+    const auto diffuse = cos_o * INV_PI<T>;
+    return {jacobian, diffuse, diffuse * (FLAT<T> / (cos_o + FLAT_COSINE<T>))};
+}
+
 // What an interface does with the directions of `g`.
 template <class T>
 inline Crossing<T> crossing(const Interface<T>& interface, const Geometry<T>& g) {
@@ -404,13 +412,20 @@ inline Crossing<T> crossing(const Interface<T>& interface, const Geometry<T>& g)
     const auto inverse = T(1.0) / eta;
     const auto wi = refracted<T>(g.wi, eta, inverse);
     const auto wo = refracted<T>(g.wo, eta, inverse);
-    const auto jacobian = g.wo.z * inverse * inverse / wo.z;
+    const auto [jacobian, diffuse, flat] = way_out<T>(g.wo.z, wo.z, inverse);
     const auto lost = dielectric_reflectance<T>(g.wo.z, g.wo.z * g.wo.z, eta);
-    const auto diffuse = g.wo.z * INV_PI<T>;
-    const auto flat = diffuse * (FLAT<T> / (g.wo.z + FLAT_COSINE<T>));
     const auto [lobe, pdf] = microfacet_lobe<T>(g.wi, g.wo, interface.alpha, interface.alpha);
     const auto value = lobe * dielectric_reflectance<T>(g.cos_d, g.cos_d * g.cos_d, eta);
     return Crossing<T>{wi, wo, jacobian, lost, diffuse, flat, value, pdf};
+}
+
+// `eval_pdf_lobes_below`, given the `microfacet_lobe` of the refracted directions.
+template <class T>
+inline Lobes<T> lobes_below(const Principled<T>& p, const Crossing<T>& c, T spec, T spec_pdf) {
+    const auto diffuse = lerp(c.diffuse, c.flat, p.flatness);
+    const auto left = T(1.0) - p.veil * c.lost;
+    const auto below = left * lerp(diffuse, c.jacobian * spec, p.metallic);
+    return Lobes<T>{p.base_color * below + c.value, c.diffuse, c.jacobian * spec_pdf, c.pdf};
 }
 
 // The value of one instance under an interface, f cos(theta_o) [1/sr], and the densities of its lobes.
@@ -418,10 +433,7 @@ template <class T>
 inline Lobes<T> eval_pdf_lobes_below(const Principled<T>& p, const Crossing<T>& c) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
     const auto [spec, spec_pdf] = microfacet_lobe<T>(shifted<T>(c.wi, p.shift), c.wo, alpha_x, alpha_y);
-    const auto diffuse = lerp(c.diffuse, c.flat, p.flatness);
-    const auto left = T(1.0) - p.veil * c.lost;
-    const auto below = left * lerp(diffuse, c.jacobian * spec, p.metallic);
-    return Lobes<T>{p.base_color * below + c.value, c.diffuse, c.jacobian * spec_pdf, c.pdf};
+    return lobes_below<T>(p, c, spec, spec_pdf);
 }
 
 // The bound of the diffuse lobe: the closed-form integral of base and retro-reflection, plus a fitted formula for the
