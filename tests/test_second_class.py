@@ -68,7 +68,7 @@ def bare(monkeypatch, tmp_path):
 
 def test_a_class_trains_with_its_own_encoding_or_with_its_plain_parameters(bare):
     space = sources.space("bare")
-    assert for_class(LAYERED3) == CLASS
+    assert for_class(LAYERED3, target="principled") == CLASS
     assert for_class(space, steps=10).encoding == "raw"
     assert for_class(space, "paper") == PAPER
     assert for_class(space, "single").encoding == "direction"

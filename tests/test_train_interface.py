@@ -22,7 +22,7 @@ from nma.train.loss import distance
 from nma.train.recipe import for_class
 from nma.train.run import initial_layers, train_class
 
-RECIPE = for_class(LAYERED3, target="interface", network="2x16", rows=64, steps=300)
+RECIPE = for_class(LAYERED3, network="2x16", rows=64, steps=300)
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,14 @@ def tables():
     return simulate_block(Settings("layered3", 8, 40_960, 0), range(8))
 
 
-def test_the_class_chooses_the_encoding_with_estimates():
-    assert RECIPE.encoding == "layered3_bounce"
-    assert for_class(LAYERED3, target="stretched").encoding == "layered3"
+def test_the_class_chooses_the_target_and_the_encoding_with_estimates():
+    assert (RECIPE.target, RECIPE.encoding) == ("interface", "layered3_bounce")
+    assert for_class(LAYERED3, "single").target == "interface"
+    for changes in ({"target": "stretched"}, {"directional": False}, {"name": "paper"}):
+        plain = for_class(LAYERED3, **changes)
+        assert (plain.encoding, plain.dim) == ("raw" if changes.get("name") else "layered3", 0.0)
+        assert plain.target == changes.get("target", "principled")
+    assert for_class(MEASURED, "single").target == "stretched"
 
 
 def test_classes_without_an_interface_are_refused():

@@ -33,7 +33,7 @@ def recipe_for(source: Values | Tables, **changes: Any) -> Recipe:
     if isinstance(source, Tables):
         grid = source.grid
         suited = {"encoding": "azimuth", "target": "anisotropic"} if grid.phi_i else {}
-        return recipes.preset("single", grid=grid, **(suited | changes))
+        return recipes.for_class(source.space, "single", grid=grid, **(suited | changes))
     return recipes.preset("measured" if source.isotropic else "anisotropic", **changes)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from nma import network, sources
 from nma.adapter import encoding
@@ -180,6 +180,13 @@ PRESETS = {
 }
 
 
+# Changes of presets for classes whose uppermost layer is the interface of a rough dielectric.
+_BELOW: dict[str, dict[str, Any]] = {
+    "class": {"target": "interface", "dim": 0.05},
+    "single": {"target": "interface"},
+}
+
+
 def preset(name: str, **changes) -> Recipe:
     """The preset `name` with `changes` to some settings; the value `None` leaves a setting unchanged."""
     if name not in PRESETS:
@@ -190,10 +197,14 @@ def preset(name: str, **changes) -> Recipe:
 def for_class(space: ParamSpace, name: str = "class", **changes) -> Recipe:
     """The preset `name` for a class, with `changes` as for `preset`.
 
-    If the preset's encoding is named after a class, it is replaced by the encoding of the class `space` for the target,
-    or by `raw` if this class has no encoding.
+    If the class has an interface, the target of the presets `class` and `single` lies under the interface, unless
+    `changes` say otherwise. If the preset's encoding is named after a class, it is replaced by the encoding of the
+    class `space` for the target, or by `raw` if this class has no encoding.
     """
-    recipe = preset(name, **changes)
+    given = {k: v for k, v in changes.items() if v is not None}
+    if space.interface and given.get("directional", True) and given.get("target", "interface") == "interface":
+        given = _BELOW.get(name, {}) | given
+    recipe = preset(name, **given)
     if recipe.encoding not in sources.classes():
         return recipe
     return replace(recipe, encoding=encoding.of_class(space, under_interface=recipe.target == "interface"))
