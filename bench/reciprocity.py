@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +24,9 @@ from numpy.typing import NDArray
 import nma
 from bench import frames
 from nma.adapter import Adapter
-from nma.ops import Vec3, at_azimuth_0
-from nma.target import Brdf
+from nma.evaluate.reciprocity import swapped_pairs
 
 COSINES = (0.9, 0.5, 0.2)
-
-
-class Pairs(NamedTuple):
-    """Values (3, n) of f at n pairs of directions, divided by the probability density of wo.
-
-    `forward` is f(wi, wo) cos(theta_o) / density, and `swapped` is f(wo, wi) cos(theta_o) / density.
-    """
-
-    forward: NDArray
-    swapped: NDArray
 
 
 def main() -> None:
@@ -75,37 +63,13 @@ def percent(values: list[float]) -> str:
 def measured(adapter: Adapter, params: NDArray, samples: int) -> dict[str, list[float]]:
     """Returns one row of the table: the values of R, G and B for each column."""
     rng = np.random.default_rng(0)
-    every = pairs(adapter, params, np.sqrt(rng.random(samples)), rng)
+    every = swapped_pairs(adapter, params, np.sqrt(rng.random(samples)), rng)
     off = np.abs(every.forward - every.swapped).mean(axis=1) / every.forward.mean(axis=1)
     columns = {"difference": off.tolist()}
     for cosine in COSINES:
-        seen = pairs(adapter, params, np.full(samples, cosine), rng)
+        seen = swapped_pairs(adapter, params, np.full(samples, cosine), rng)
         columns[f"cos {cosine}"] = (seen.swapped.mean(axis=1) / seen.forward.mean(axis=1) - 1.0).tolist()
     return columns
-
-
-def pairs(adapter: Adapter, params: NDArray, cosines: NDArray, rng: np.random.Generator) -> Pairs:
-    """Draws one light direction from the adapter's blend for each view direction.
-
-    `cosines` (n,) are the cosines of the view directions with the normal.
-    """
-    n = len(cosines)
-    wi = at_azimuth_0(cosines)
-    brdf = prepared(adapter, params, wi)
-    # The random numbers that choose a lobe of the blend are stratified.
-    u = rng.permutation((np.arange(n) + rng.random(n)) / n), *rng.random((2, n))
-    wo, value, pdf = brdf.sample(wi, *u)
-    valid = (pdf > 0.0) & (wo.z > 1e-4)
-    wo = Vec3(*(np.where(valid, x, up) for x, up in zip(wo, (0.0, 0.0, 1.0), strict=True)))
-    # The swapped evaluation returns f(wo, wi) cos(theta_i); the factor wo.z / wi.z makes this f(wo, wi) cos(theta_o).
-    back = np.stack(prepared(adapter, params, wo).eval(wo, wi)) * wo.z / wi.z
-    weight = np.where(valid, 1.0 / np.where(valid, pdf, 1.0), 0.0)
-    return Pairs(np.stack(value) * weight, back * weight)
-
-
-def prepared(adapter: Adapter, params: NDArray, w: Vec3) -> Brdf:
-    """Returns the BRDF of one material, with the blend's parameters computed for the view directions `w`."""
-    return adapter.prepare([np.full(len(w.z), x) for x in params], w)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nma.cli.evaluate import _finite
+from nma.evaluate.brightness import BANDS
 from nma.evaluate.metrics import FIGURES
 
 
@@ -24,8 +25,9 @@ def test_simulate_and_evaluate_print_one_json_object_and_nothing_else(nma, untra
     assert set(result) == {"mean", "materials"}
     assert len(result["materials"]) == 2
     for figures in (result["mean"], *result["materials"]):
-        assert tuple(figures) == FIGURES
-        assert np.isfinite(list(figures.values())).all()
+        assert tuple(figures) == (*FIGURES, "signed_theta_i", "signed_theta_o", "non_reciprocity")
+        assert all(np.isfinite(values).all() for values in figures.values())
+        assert len(figures["signed_theta_i"]) == len(figures["signed_theta_o"]) == BANDS
     for name in FIGURES:
         assert result["mean"][name] == pytest.approx(np.mean([m[name] for m in result["materials"]]))
 

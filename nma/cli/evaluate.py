@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import RenderableType
 
 from nma.cli import console, options
+
+if TYPE_CHECKING:
+    from nma.evaluate import Evaluation
+    from nma.evaluate.brightness import Brightness
 
 
 def register(app: typer.Typer) -> None:
@@ -42,7 +47,7 @@ def evaluate(
     with console.counting("evaluating", len(tables.params), "materials/s", digits=2) as show:
         result = run(adapter, tables, lambda done: show(done, done), clamp=clamp)
     if as_json:
-        print(json.dumps({"mean": _finite(result.mean), "materials": [_finite(m) for m in result.materials]}))
+        print(json.dumps(_as_json(result)))
         return
     rows = [(str(n), *(m[f] for f in FIGURES)) for n, m in enumerate(result.materials)]
     rows.append(("mean", *(result.mean[f] for f in FIGURES)))
@@ -53,10 +58,40 @@ def evaluate(
         f"The adapter's bin averages are exact to {result.integration_error:.1e} in log loss, "
         f"its albedos to {result.albedo_integration_error:.1e}."
     )
+    console.out.print(_brightness(result))
+    console.out.print(f"Non-reciprocity: {result.mean_non_reciprocity:.3f} of the reflected light.")
     if result.estimated_error:
         console.out.print(
             "The reference has no standard errors. Its noise floor is an upper bound, from the number of walks."
         )
+
+
+def _brightness(result: Evaluation) -> RenderableType:
+    """A table that says at which cosines the adapter is too bright (+) or too dark (-), over all materials."""
+    from nma.evaluate.brightness import band_ends
+
+    head = ("brightness [%]", *(f"{low:.1f} to {high:.1f}" for low, high in band_ends()))
+    rows = [
+        (f"over cos({name})", *(f"{100 * x:+.1f}" for x in errors))
+        for name, errors in result.signed_of_all._asdict().items()
+    ]
+    return console.table(head, rows, "Signed error of brightness, by cosine")
+
+
+def _as_json(result: Evaluation) -> dict[str, Any]:
+    def entry(figures: dict[str, float], signed: Brightness, non_reciprocity: float) -> dict[str, Any]:
+        bands = {f"signed_{name}": list(map(_number, errors)) for name, errors in signed._asdict().items()}
+        return _finite(figures) | bands | {"non_reciprocity": non_reciprocity}
+
+    each = zip(result.materials, result.signed, result.non_reciprocity, strict=True)
+    return {
+        "mean": entry(result.mean, result.signed_of_all, result.mean_non_reciprocity),
+        "materials": [entry(*material) for material in each],
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
@@ -64,4 +99,4 @@ def _finite(figures: dict[str, float]) -> dict[str, float | None]:
 
     The PSNR of equal tables is infinite.
     """
-    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
+    return {name: _number(value) for name, value in figures.items()}

@@ -13,6 +13,8 @@ from nma import ops
 from nma.adapter import Adapter
 from nma.errors import TableError
 from nma.evaluate import metrics
+from nma.evaluate.brightness import Brightness, Energy, energy, signed_errors
+from nma.evaluate.reciprocity import non_reciprocity
 from nma.jit import dr
 from nma.lattice import lattice_points
 from nma.table import ISOTROPIC, Grid, Tables, quadrature
@@ -34,6 +36,8 @@ _SHARP = 10.0
 class Evaluation:
     """The error figures of each material, and the mean of each figure over the materials.
 
+    `signed` has the signed errors of brightness of each material, and `signed_of_all` those of all materials' added
+    energies. `non_reciprocity` has a value for each material (`nma.evaluate.reciprocity`).
     `integration_error` (in log loss) and `albedo_integration_error` estimate the errors of the numerical integration
     over bins, from two integrations with different points. `estimated_error` is true if the reference tables have no
     standard errors, so that standard errors were estimated from the number of walks.
@@ -44,6 +48,13 @@ class Evaluation:
     integration_error: float
     albedo_integration_error: float
     estimated_error: bool
+    signed: list[Brightness]
+    signed_of_all: Brightness
+    non_reciprocity: list[float]
+
+    @property
+    def mean_non_reciprocity(self) -> float:
+        return float(np.mean(self.non_reciprocity))
 
 
 def tabulate_adapter(
@@ -183,19 +194,28 @@ def evaluate(
     if not len(reference.params):
         raise TableError("the reference holds no material")
     params = adapter.check(reference.params, clamp)
-    materials, spreads = [], []
+    materials, spreads, energies = [], [], []
     for n in range(len(params)):
         halves = [tabulate_adapter(adapter, params[n : n + 1], shift=s)[0] for s in (0.0, 0.5)]
         mean = 0.5 * (halves[0] + halves[1])
         materials.append(metrics.table_metrics(mean, reference.values[n], _error(reference, n)))
+        energies.append((energy(mean), energy(reference.values[n])))
         spread = metrics.table_metrics(halves[0], halves[1], np.zeros_like(mean))
         # On average, the error of the mean of two independent estimates is half of the difference between the
         # estimates.
         spreads.append((0.5 * spread["log_loss"], 0.5 * spread["albedo_error"]))
         progress(n + 1)
     log_loss, albedo = np.mean(spreads, axis=0)
+    ours, theirs = (Energy(*map(np.stack, zip(*side, strict=True))) for side in zip(*energies, strict=True))
     return Evaluation(
-        materials, metrics.mean_metrics(materials), float(log_loss), float(albedo), reference.error is None
+        materials,
+        metrics.mean_metrics(materials),
+        float(log_loss),
+        float(albedo),
+        reference.error is None,
+        [signed_errors(a, b) for a, b in energies],
+        signed_errors(ours, theirs),
+        [non_reciprocity(adapter, p) for p in params],
     )
 
 
