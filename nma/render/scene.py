@@ -136,6 +136,13 @@ def material_mask(
 ) -> NDArray[np.bool_]:
     """Which pixels show the material: (height, width) booleans, from one camera ray through the middle of each
     pixel."""
+    return np.isfinite(material_cosines(size, camera))
+
+
+def material_cosines(
+    size: tuple[int, int] = (256, 256), camera: str | Camera | None = None
+) -> NDArray[np.float64]:
+    """cos(theta_i) of the camera ray through the middle of each pixel, (height, width); NaN beside the material."""
     import drjit as dr
     import mitsuba as mi
 
@@ -144,10 +151,12 @@ def material_mask(
     x, y = dr.meshgrid(dr.arange(mi.Float, width), dr.arange(mi.Float, height))
     middle = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, middle, mi.Point2f(0.5))
+    hit = scene.ray_intersect(ray)
 
     # A ray hits the ball if the pointer of the shape that it hits is the pointer of the ball.
     ball = next(shape for shape in scene.shapes() if shape.id() == "ball")
-    return np.array(scene.ray_intersect(ray).shape == mi.ShapePtr(ball)).reshape(height, width)
+    on_ball = np.array(hit.shape == mi.ShapePtr(ball))
+    return np.where(on_ball, np.array(hit.wi.z), np.nan).reshape(height, width)
 
 
 def material_coverage(size: tuple[int, int] = (256, 256), camera: str | Camera | None = None) -> float:
