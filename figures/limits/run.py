@@ -1,6 +1,6 @@
 """Finds what limits the accuracy of class adapters, by comparison with fits to single materials with several targets.
 
-    python -m figures.limits.run [--quick] [--materials N]
+    python -m figures.limits.run [--quick] [--materials N] [--residuals WEIGHTS]
 
 A fit is trained on the table that it is evaluated on, so its remaining error comes from the target. A class adapter
 with the same target has a larger error, and the additional error comes from the network, the data and the optimiser.
@@ -8,8 +8,12 @@ The experiment takes the first materials of the set "range", which is in random 
 fit is trained on the material's reference table and evaluated on the same table. The metrics of finished materials are
 kept in out/figures/limits.
 
-Writes limits.json and limits.png beside this file. With --quick, makes short fits to two materials and writes to
-out/figures/limits.
+The relative residuals of an adapter are plotted over theta_i, theta_o and phi for the ten
+materials of the set with the largest log losses. The option --residuals names the adapter; with it, the script plots
+the residuals alone, and makes no fits.
+
+Writes limits.json, limits.png, residuals.json and residuals.png beside this file. With --quick, makes short fits to two
+materials and writes to out/figures/limits.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from matplotlib.figure import Figure
 
 import nma
 from figures import common
+from figures.limits import residuals
 from nma.train.recipe import Recipe, preset
 from nma.train.run import fit_material
 
@@ -42,11 +47,17 @@ def main() -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--materials", type=int, default=6)
     parser.add_argument("--steps", type=int, default=4000, help="steps of each fit")
+    parser.add_argument("--residuals", metavar="WEIGHTS", help="plot the residuals of this adapter alone")
     arguments = parser.parse_args()
     if arguments.quick:
         vars(arguments).update(materials=2, steps=100)
     folder = common.results(__file__, arguments.quick)
     reference = common.reference(SET, arguments.quick)
+    weights = arguments.residuals or nma.shipped()[-1]
+    worst = residuals.write(weights, reference, folder / "residuals.png")
+    common.write_json(folder / "residuals.json", {"adapter": Path(weights).stem, "worst": worst})
+    if arguments.residuals:
+        return
     rows = [contenders(reference, number, arguments) for number in range(arguments.materials)]
     rows.sort(key=lambda row: row[nma.shipped()[-1]]["log_loss"])
     result = summary(rows)
