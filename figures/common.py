@@ -32,6 +32,7 @@ SETS: dict[str, tuple[int, Population, int]] = {
     "metals": (60, "unseen_metals", 60),
 }
 REFERENCE_WALKS = 64_000_000
+QUICK_WALKS = 4_000_000
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
@@ -63,13 +64,24 @@ def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
 def reference(name: str, quick: bool) -> nma.Tables:
     """Returns the reference tables of a set in SETS, made by `nma simulate` if their file does not exist."""
     count, population, seed = SETS[name]
-    count, walks = (4, 4_000_000) if quick else (count, REFERENCE_WALKS)
-    path = REFERENCES / f"{name}-{count}x{walks}.npz"
-    options = {"--draw": count, "--population": population, "--seed": seed, "--walks": walks, "-o": path}
-    words = [str(word) for option in options.items() for word in option]
+    count, walks = (4, QUICK_WALKS) if quick else (count, REFERENCE_WALKS)
+    options = {"--draw": count, "--population": population, "--seed": seed, "--walks": walks}
+    return simulated(REFERENCES / f"{name}-{count}x{walks}.npz", options)
+
+
+def named_reference(material: str, quick: bool) -> nma.Tables:
+    """Returns the reference table of a named material, made by `nma simulate` if its file does not exist."""
+    walks = QUICK_WALKS if quick else REFERENCE_WALKS
+    options = {"--material": material, "--walks": walks}
+    return simulated(REFERENCES / f"named-{material}-{walks}.npz", options)
+
+
+def simulated(path: Path, options: dict[str, Any]) -> nma.Tables:
+    """Returns the tables of a file, made by `nma simulate` with `options` if the file does not exist."""
+    words = [str(word) for option in (options | {"-o": path}).items() for word in option]
     REFERENCES.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:
-        # If another experiment simulates the same set, wait for its result.
+        # If another experiment simulates the same tables, wait for its result.
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             subprocess.run([sys.executable, "-m", "nma.cli", "simulate", *words], check=True)

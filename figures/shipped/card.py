@@ -20,6 +20,7 @@ from nma.render.load import load_dict
 from nma.render.progressive import render_passes
 
 WORST = 10
+ANGLES = ("theta_i", "theta_o")
 LIMITS = """\
 - The adapter was trained for the class `layered3` within the ranges of its training data. The adapter rejects
   parameters outside these ranges, or clamps parameters to the ranges on request.
@@ -31,23 +32,32 @@ LIMITS = """\
 """
 
 
-def write(weights: str, sets: dict[str, tuple[nma.Tables, dict]], folder: Path, quick: bool) -> Path:
+def write(
+    weights: str, sets: dict[str, tuple[nma.Tables, dict]], named: dict[str, dict], folder: Path, quick: bool
+) -> Path:
     """Writes the model card of one adapter with its pictures, and returns the card's path.
 
     Args:
         weights: a weights file or a shipped name.
         sets: the reference tables and the results of each set of materials, by the set's name.
+        named: the signed errors of brightness of each named material, by its name.
         quick: whether to render fewer pictures, with fewer samples per pixel.
     """
     adapter, name = nma.Adapter.load(weights), Path(weights).stem
     _histogram(sets, folder / f"{name}-errors.png")
     captions = _worst(weights, sets, folder / f"{name}-worst.png", quick)
     card = folder / f"{name}.md"
-    write_text(card, _text(name, adapter, sets, captions))
+    write_text(card, _text(name, adapter, sets, named, captions))
     return card
 
 
-def _text(name: str, adapter: nma.Adapter, sets: dict[str, tuple[nma.Tables, dict]], worst: list[str]) -> str:
+def _text(
+    name: str,
+    adapter: nma.Adapter,
+    sets: dict[str, tuple[nma.Tables, dict]],
+    named: dict[str, dict],
+    worst: list[str],
+) -> str:
     record, count = adapter.training, network.parameters(adapter.layers)
     data, recipe = record["dataset"], record["recipe"]
     bound = "bounded" if adapter.bounded else "not bounded"
@@ -71,6 +81,15 @@ metal that was held out of training.
 
 ![Histograms of log loss and albedo error]({name}-errors.png)
 
+## Brightness
+The signed error of brightness in %, in five bands of the cosine from 0 (grazing) to 1, and the non-reciprocity.
+[docs/evaluation.md](../../docs/evaluation.md) defines both. Errors are positive where the adapter is too bright.
+
+The errors of materials partly cancel in the rows of a set, so each set has a second row: the mean size of the errors of
+its materials, without sign.
+
+{_brightness({label: result["brightness"] for label, (_, result) in sets.items()} | named)}
+
 ## The worst materials
 {chr(10).join(f"{k + 1}. {line}" for k, line in enumerate(worst))}
 
@@ -89,6 +108,19 @@ def _table(sets: dict[str, tuple[nma.Tables, dict]]) -> str:
     ]
     for worst in ("worst_log_loss", "worst_albedo_error"):
         rows.append((worst.replace("_", " "), *(f"{result[worst]:.4f}" for _, result in sets.values())))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def _brightness(found: dict[str, dict]) -> str:
+    """Returns a table with a row for each set of materials and each named material."""
+    rows: list[tuple[str, ...]] = [("", "over cos(theta_i)", "over cos(theta_o)", "non-reciprocity")]
+    rows.append(("---",) * len(rows[0]))
+    for name, errors in found.items():
+        bands = (", ".join(f"{100 * x:+.1f}" for x in errors[angle]) for angle in ANGLES)
+        rows.append((name, *bands, f"{errors['non_reciprocity']:.3f}"))
+        if name in common.SETS:
+            sizes = (", ".join(f"{100 * x:.1f}" for x in errors[f"{angle}_size"]) for angle in ANGLES)
+            rows.append((f"{name}, mean size", *sizes, ""))
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
