@@ -18,7 +18,7 @@ from nma.conductors import load_conductors
 from nma.errors import ParamError
 
 Law = Literal["uniform", "log10", "one_minus_square", "conductor"]
-Population = Literal["mixed", "range", "metals", "held_out_metals", "unseen_metals"]
+Population = Literal["mixed", "broad", "range", "metals", "held_out_metals", "unseen_metals"]
 Range = Literal["training", "valid"]
 
 # A parameter may exceed a bound by ROUNDING, or by ROUNDING times the range if the range is narrower than 1. Textures
@@ -91,7 +91,17 @@ class Param:
     def draw(self, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
         """Random values (n, size), drawn from the parameter's law. For the law "conductor", the values are uniform (see
         `ParamSpace.sample`)."""
-        u = rng.random((n, self.size))
+        return self._of_unit(rng.random((n, self.size)))
+
+    def draw_extreme(self, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+        """Random values (n, size) that are denser towards both ends of the training range. Half of the colours are
+        grey."""
+        u = rng.beta(0.5, 0.5, (n, self.size))
+        grey = rng.random((n, 1)) < 0.5
+        return self._of_unit(np.where(grey, u[:, :1], u))
+
+    def _of_unit(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Maps uniform random numbers to values that follow the parameter's law."""
         if self.law == "log10":
             return 10.0 ** (np.log10(self.low) + u * np.log10(self.high / self.low))
         if self.law == "one_minus_square":
@@ -197,8 +207,11 @@ class ParamSpace:
 
         For classes with a conductor, `population` chooses how (eta, k) is drawn. "range" draws every channel uniformly.
         "metals" draws from the real metals, except those held out for tests. "held_out_metals" draws only from the
-        metals held out. "mixed", for training, uses "range" or "metals" with equal probability. "unseen_metals", for
-        tests, draws every third material from the metals held out and the other materials from the other metals.
+        metals held out. "mixed", for training, uses "range" or "metals" with equal probability. "broad", for training,
+        draws a third of the materials from "range", a third from "metals", and a third from "metals" with all other
+        parameters near the ends of their ranges (`Param.draw_extreme`), where the materials lie that people choose.
+        "unseen_metals", for tests, draws every third material from the metals held out and the other materials from the
+        other metals.
         """
         if population not in get_args(Population):
             raise ParamError(
@@ -210,7 +223,14 @@ class ParamSpace:
         metals = load_conductors()
         known, held_out = np.nonzero(~metals.held_out)[0], np.nonzero(metals.held_out)[0]
         pick = known[rng.integers(len(known), size=n)]
-        rows = rng.random(n) < 0.5 if population == "mixed" else np.ones(n, bool)
+        choice = rng.random(n)
+        rows = np.ones(n, bool)
+        if population == "mixed":
+            rows = choice < 0.5
+        if population == "broad":
+            rows = choice < 2 / 3
+            extreme = np.concatenate([p.draw_extreme(rng, n) for p in self.params], axis=1)
+            out[choice < 1 / 3] = extreme[choice < 1 / 3]
         if population in ("held_out_metals", "unseen_metals"):
             step = 1 if population == "held_out_metals" else 3
             pick[::step] = held_out[rng.integers(len(held_out), size=len(pick[::step]))]

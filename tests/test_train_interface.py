@@ -1,5 +1,7 @@
 """Training adapters whose target lies under the interface of their class."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from target_cases import FAST_COMPILE
@@ -17,6 +19,7 @@ from nma.microfacet import fresnel_conductor_rgb, fresnel_dielectric
 from nma.ops import Color, Vec3
 from nma.params import LAYERED3, MEASURED
 from nma.table.dataset import Settings, simulate_block
+from nma.train import loop
 from nma.train.batches import BinSampler, Pool, draw
 from nma.train.loss import distance
 from nma.train.recipe import for_class
@@ -120,3 +123,16 @@ def test_the_term_for_dim_bins_sees_relative_errors(tables):
     # log(.02 + .02) - log(.02 + .01), of which the Huber loss takes nearly all
     np.testing.assert_allclose(weighed - plain, np.log(4 / 3), rtol=0.05)
     assert plain < 0.012
+
+
+def test_a_target_may_be_without_some_parameters(tables, tmp_path):
+    """The network has no outputs for them, and they are 0. A checkpoint of such a run can be continued."""
+    recipe = replace(RECIPE, network="1x8", without=("shift", "anisotropic"), steps=2)
+    checkpoint = tmp_path / "c"
+    adapter, _ = train_class(LAYERED3, recipe, tables, {}, checkpoint=checkpoint)
+    assert adapter.outputs == 15
+    blend = adapter.prepare(list(tables.params[0]), Vec3(0.6, 0.0, 0.8)).blend
+    assert all((p.shift, p.anisotropic) == (0.0, 0.0) and p.veil > 0.0 for p in blend.instances)
+    assert loop.resume(recipe, adapter.layers, checkpoint).step == 2
+    with pytest.raises(NmaError, match="cannot be without sheen; it can be without anisotropic, flatness"):
+        replace(RECIPE, without=("sheen",))

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import nma
 from figures import common
 from nma.table import stream_keys
-from nma.train.recipe import preset
+from nma.train.recipe import for_class
 from nma.train.run import fit_material
 
 
@@ -44,7 +44,7 @@ def main() -> None:
 def fit(name: str, walks: int, reference_walks: int, quick: bool) -> dict:
     """Fits one material as `nma fit` does, and evaluates the fit on a reference from an independent random stream."""
     source, vector = nma.source("layered3"), nma.load_material(name).vector()
-    recipe = preset("single", steps=100 if quick else None)
+    recipe = for_class(source.space, "single", steps=100 if quick else None)
     began = time.perf_counter()
     tables = nma.tabulate(source, vector[None], walks, stream_keys(recipe.seed, [0]), error=False)
     adapter, _ = fit_material(source.space, recipe, vector, tables, {})

@@ -30,15 +30,17 @@ from matplotlib.figure import Figure
 import nma
 from figures import common
 from figures.limits import residuals
-from nma.train.recipe import Recipe, preset
+from nma.adapter import DEFAULT_ADAPTER
+from nma.train.recipe import Recipe, for_class
 from nma.train.run import fit_material
 
 SET = "range"
-# The targets of the fits. The first target is the same as that of the shipped class adapters.
+# The targets of the fits. The first target is that of the adapters layered3-3x32 and layered3-5x64.
 TARGETS: dict[str, dict[str, Any]] = {
-    "fit, two instances": {"target": "principled"},
+    "fit, two under the coat": {},
+    "fit, four under the coat": {"instances": 4},
+    "fit, two Principled": {"target": "principled"},
     "fit, two stretched": {"target": "stretched"},
-    "fit, four stretched": {"target": "stretched", "instances": 4},
 }
 FIGURES = ("log_loss", "albedo_error")
 
@@ -53,13 +55,13 @@ def main() -> None:
         vars(arguments).update(materials=2, steps=100)
     folder = common.results(__file__, arguments.quick)
     reference = common.reference(SET, arguments.quick)
-    weights = arguments.residuals or nma.shipped()[-1]
+    weights = arguments.residuals or DEFAULT_ADAPTER
     worst = residuals.write(weights, reference, folder / "residuals.png")
     common.write_json(folder / "residuals.json", {"adapter": Path(weights).stem, "worst": worst})
     if arguments.residuals:
         return
     rows = [contenders(reference, number, arguments) for number in range(arguments.materials)]
-    rows.sort(key=lambda row: row[nma.shipped()[-1]]["log_loss"])
+    rows.sort(key=lambda row: row[DEFAULT_ADAPTER]["log_loss"])
     result = summary(rows)
     print(json.dumps(result, indent=1))
     common.write_json(folder / "limits.json", {"mean": result, "materials": rows})
@@ -79,7 +81,7 @@ def compete(number: int, table: nma.Tables, arguments: Namespace) -> dict:
     for name in nma.shipped()[::-1]:
         row[name], row["noise"] = figures(nma.Adapter.load(name), table)
     for name in list(TARGETS)[: 1 if arguments.quick else None]:
-        row[name] = fit(table, preset("single", steps=arguments.steps, **TARGETS[name]))
+        row[name] = fit(table, for_class(nma.LAYERED3, "single", steps=arguments.steps, **TARGETS[name]))
     print(number, {k: v["log_loss"] for k, v in row.items() if k != "params"}, flush=True)
     return row
 

@@ -96,7 +96,7 @@ def _network(name: str | None) -> str | None:
 TARGETS = ("principled", "stretched", "interface", "measured", "anisotropic")
 POINTS_LAWS = ("crowded", "uniform", "centre")
 LOSSES = ("huber", "log")
-POPULATIONS = ("mixed", "range", "metals", "held_out_metals", "unseen_metals")
+POPULATIONS = ("mixed", "broad", "range", "metals", "held_out_metals", "unseen_metals")
 # The paper's variants of the target, as pairs: the number of Principled BRDFs in the blend, and whether the parameters
 # of these BRDFs depend on the view direction.
 VARIANTS = {"blended+omega_i": (2, True), "blended": (2, False), "omega_i": (1, True), "single": (1, False)}
@@ -148,6 +148,8 @@ Rate = Annotated[
 TrainingSeed = Annotated[int, seed("Seed of the weights, of the batches and of a simulated table.")]
 
 # Options of commands that use an adapter.
+# The value of `nma.adapter.DEFAULT_ADAPTER`, whose import would slow down `--help`.
+DEFAULT_ADAPTER = "layered3-3x32"
 AdapterName = Annotated[str, typer.Option(help="A shipped adapter's name or a weights file.")]
 Clamp = Annotated[
     bool,

@@ -186,8 +186,9 @@ def resume(recipe: Recipe, layers: Weights, path: Path, record: dict[str, Any] |
             losses, log_losses = f["losses"].tolist(), f["log_losses"].tolist()
     except Exception as e:
         raise NmaError(f"{path}: damaged checkpoint ({e}); delete the file to start again") from None
-    if notes["recipe"] != asdict(recipe):
-        changed = [k for k, v in asdict(recipe).items() if notes["recipe"].get(k) != v]
+    settings = json.loads(json.dumps(asdict(recipe)))
+    if notes["recipe"] != settings:
+        changed = [k for k, v in settings.items() if notes["recipe"].get(k) != v]
         raise NmaError(
             f"{path} belongs to a run with other settings ({', '.join(changed)}); "
             "delete the file, or restore the settings"

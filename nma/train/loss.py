@@ -38,7 +38,7 @@ def brdf_of(layers: Layers, batch: Any, recipe: Recipe) -> Brdf:
     """
     raw = network_outputs(layers, batch, recipe)
     interface = target.Interface(*batch.interface) if recipe.target == "interface" else None
-    blend = target.decode(list(raw.T), recipe.instances, target.TARGETS[recipe.target], batch.mu, interface)
+    blend = target.decode(list(raw.T), recipe.instances, recipe.params, batch.mu, interface)
     return Brdf(target.bounded(blend, batch.mu) if recipe.bounds_energy else blend)
 
 
@@ -93,13 +93,16 @@ def brdf_loss(brdf: Brdf, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.
 
 
 def albedo_loss(brdf: Brdf, batch: Any, recipe: Recipe) -> jax.Array | float:
-    """The squared error of the directional albedo, times its weight in the recipe."""
+    """The squared error of the directional albedo, absolute or relative, times its weight in the recipe."""
     if not recipe.albedo > 0:
         return 0.0
     # The loss is the product of the errors of two independent estimates, because the expected product does not contain
     # the variance of the estimates. The squared error of a single estimate would contain the variance.
     first, second = albedos(brdf, batch, recipe) - batch.albedo
-    return recipe.albedo * (first * second).mean()
+    scale = 1.0
+    if recipe.albedo_floor > 0:
+        scale = 1.0 / (batch.albedo + recipe.albedo_floor)
+    return recipe.albedo * (first * second * scale * scale).mean()
 
 
 def distance(mean: jax.Array, batch: Batch, recipe: Recipe) -> tuple[jax.Array, jax.Array]:

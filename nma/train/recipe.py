@@ -11,6 +11,7 @@ from nma.errors import NmaError
 from nma.params import ParamSpace
 from nma.table import ISOTROPIC, Grid
 from nma.table.quadrature import FINEST
+from nma.target import TARGETS, TargetParam
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Recipe:
       (`nma.target.interface`). "measured" adds to "stretched" three more parameters per instance: one flattens the
       diffuse lobe, and two fade out the whole instance where the half vector is far from the normal. "anisotropic" has
       the parameters of "measured", but stretches lobes along the axes of the surface.
+    - `without`: parameters of the target that the network does not set. They are 0.
     - `grid`: the resolution of the tables.
     - `bounded`: if true, the target is dimmed where it might reflect more light than it receives. Targets that are not
       `directional` are never dimmed.
@@ -44,6 +46,8 @@ class Recipe:
       them, because its logarithm is that of 1 + value.
     - `albedo`: weight of the squared error of the directional albedo, which is estimated from two times
       `albedo_samples` samples per row.
+    - `albedo_floor`: if above 0, errors of the albedo are relative to `albedo_floor` + albedo, so that dark materials
+      count as much as bright ones.
     - `schedule`: how the learning rate changes. "onecycle" rises to `learning_rate` and falls again. "plateau" starts
       at `learning_rate` and halves the rate when the loss stalls. "constant" keeps `learning_rate`.
     - `average`: decay of the exponential moving average of the weights; 0 means no averaging.
@@ -53,6 +57,7 @@ class Recipe:
     instances: int = 2
     directional: bool = True
     target: Literal["principled", "stretched", "interface", "measured", "anisotropic"] = "principled"
+    without: tuple[str, ...] = ()
     bounded: bool = True
     encoding: str = "layered3"
     rows: int = 512
@@ -66,6 +71,7 @@ class Recipe:
     dim: float = 0.0
     dim_floor: float = 0.02
     albedo: float = 1.0
+    albedo_floor: float = 0.0
     albedo_samples: int = 8
     schedule: Literal["onecycle", "plateau", "constant"] = "onecycle"
     learning_rate: float = 3e-3
@@ -92,6 +98,12 @@ class Recipe:
                 "a target stretched along the plane of incidence depends on the direction, so it cannot have constant "
                 "parameters; use the target 'principled'"
             )
+        names = {p.name for p in TARGETS[self.target]} - {"base_color"}
+        if unknown := set(self.without) - names:
+            raise NmaError(
+                f"the target '{self.target}' cannot be without {', '.join(sorted(unknown))}; it can be without "
+                f"{', '.join(sorted(names))}"
+            )
         if bool(self.grid.phi_i) != (self.target == "anisotropic"):
             raise NmaError(
                 "the target 'anisotropic' needs a grid with azimuths of wi, and such a grid needs this target; "
@@ -99,6 +111,11 @@ class Recipe:
             )
         if not 0 <= self.average < 1:
             raise NmaError(f"average must be at least 0 and below 1, got {self.average}")
+
+    @property
+    def params(self) -> tuple[TargetParam, ...]:
+        """The parameters of an instance that the network sets."""
+        return tuple(p for p in TARGETS[self.target] if p.name not in self.without)
 
     @property
     def bounds_energy(self) -> bool:
@@ -182,7 +199,14 @@ PRESETS = {
 
 # Changes of presets for classes whose uppermost layer is the interface of a rough dielectric.
 _BELOW: dict[str, dict[str, Any]] = {
-    "class": {"target": "interface", "dim": 0.05},
+    "class": {
+        "target": "interface",
+        "energy": 0.15,
+        "dim": 0.05,
+        "albedo": 0.2,
+        "albedo_floor": 0.1,
+        "steps": 50_000,
+    },
     "single": {"target": "interface"},
 }
 

@@ -63,7 +63,7 @@ def initial_layers(recipe: Recipe, space: ParamSpace) -> Layers:
     start = _INITIAL_BELOW if recipe.target == "interface" else _INITIAL
     instances = tuple(start.instances[k % 2] for k in range(recipe.instances))
     blend = Blend(instances, (1.0 / recipe.instances,) * recipe.instances)
-    params = target.TARGETS[recipe.target]
+    params = recipe.params
     bias = np.array(target.encode(blend if recipe.instances != 2 else start, params))
     inputs = encoding.size(recipe.encoding, space, recipe.directional)
     sizes = [inputs, *network.hidden(recipe.network), target.output_size(recipe.instances, params)]
@@ -77,7 +77,7 @@ def _estimates(recipe: Recipe, inputs: int, outputs: int) -> NDArray[np.float32]
     """The weights (outputs, inputs) by which the last layer passes on estimates among the inputs to the outputs that
     they estimate. None if the recipe's encoding has no estimates."""
     estimated = encoding.ESTIMATES.get(recipe.encoding, ())
-    names = [p.name for p in target.TARGETS[recipe.target] for _ in range(p.size)]
+    names = [p.name for p in recipe.params for _ in range(p.size)]
     rows = [names.index(name) + k for name in estimated for k in range(names.count(name))]
     if not rows:
         return None
@@ -162,7 +162,7 @@ def adapter_of(space: ParamSpace, recipe: Recipe, run: loop.Run, record: dict[st
         loop.result(run, recipe),
         recipe.instances,
         recipe.directional,
-        target.TARGETS[recipe.target],
+        recipe.params,
         training,
         recipe.bounds_energy,
         space.interface if recipe.target == "interface" else None,
