@@ -278,12 +278,14 @@ def test_samples_with_alpha_off_by_five_per_cent_are_rejected(bins):
     assert np.mean(p < SIDAK) > (0.15 if bins[0].blend.interface else 0.5)
 
 
-def test_lobe_probabilities_follow_the_albedos():
+@pytest.mark.parametrize("below, median, largest", [(False, 0.2, 0.7), (True, 0.25, 1.5)])
+def test_lobe_probabilities_follow_the_albedos(below, median, largest):
     """Each lobe is chosen about as often as its share of the albedo, so that sample weights vary little.
 
-    A failure means that the estimates of the lobes' albedos are poor, and renderings become noisier.
+    Under an interface, they vary more, because many samples are reflected back down. A failure means that the estimates
+    of the lobes' albedos are poor, and renderings become noisier.
     """
-    cases = Cases(seed=32, dialect=False)
+    cases = Cases(seed=32, dialect=False, below=below)
     count = 4096
     lane = dr.arange(dr.llvm.UInt, N_BLENDS * count)
     blend, wi, _ = cases.at(dr.llvm.Float, lane // count)
@@ -291,8 +293,8 @@ def test_lobe_probabilities_follow_the_albedos():
     _, value, pdf = target.sample(blend, wi, *(rng.random(dr.llvm.Float, N_BLENDS * count) for _ in range(3)))
     weight = dr.select(pdf > 0, ops.mean(value) / pdf, 0.0).numpy().reshape(N_BLENDS, count)
     deviation = weight.std(1) / weight.mean(1)
-    assert np.median(deviation) < 0.2
-    assert deviation.max() < 0.7
+    assert np.median(deviation) < median
+    assert deviation.max() < largest
     total = sum(sum(p) for p in lobe_probabilities(cases.blend, cases.wi.z))
     np.testing.assert_allclose(total, 1.0, rtol=1e-5)
 

@@ -73,6 +73,7 @@ FUNCTIONS: tuple[Callable, ...] = (
     albedo.clearcoat_albedo,
     albedo.lobe_albedos,
     albedo.interface_albedo,
+    albedo.leaving,
     albedo.lobe_albedos_below,
     sampling.sample_diffuse,
     sampling.sample_spec,

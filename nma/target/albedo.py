@@ -39,11 +39,13 @@ _W0, _W1, _W2 = 1.0 / 21.0, 1.0 / 84.0, 1.0 / 252.0
 
 
 class Albedos(NamedTuple):
-    """Upper bounds of the directional albedo of each lobe of an instance."""
+    """Upper bounds of the directional albedo of each lobe of an instance, and an estimate of the part of the specular
+    lobe's light that leaves through the interface above."""
 
     diffuse: Color
     spec: Color
     clearcoat: Float
+    leaving: Float
 
 
 def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
@@ -55,6 +57,7 @@ def lobe_albedos(p: Principled, cos_theta_i: Float) -> Albedos:
         diffuse_albedo(p, cos_theta_i, weight) + MIN_ALBEDO,
         spec_albedo(p, cos_theta_i) + MIN_ALBEDO,
         clearcoat_albedo(p, cos_theta_i, weight),
+        1.0,
     )
 
 
@@ -62,13 +65,31 @@ def lobe_albedos_below(p: Principled, interface: Interface, cos_theta_i: Float) 
     """The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
     interface's own lobe. The bounds ignore the light that is lost on the way out."""
     alpha_x, alpha_y = spec_alpha(p.roughness, p.anisotropic)
-    below = cos_below(cos_theta_i, interface.eta, 1.0 / interface.eta)
-    unmasked = unmasked_albedo(ops.minimum(alpha_x, alpha_y), cos_shifted(below, p.shift))
+    alpha = ops.minimum(alpha_x, alpha_y)
+    inverse = 1.0 / interface.eta
+    view = cos_shifted(cos_below(cos_theta_i, interface.eta, inverse), p.shift)
     return Albedos(
         p.base_color * (1.0 - p.metallic) + MIN_ALBEDO,
-        p.base_color * (p.metallic * unmasked) + (SPEC_MARGIN + MIN_ALBEDO),
+        p.base_color * (p.metallic * unmasked_albedo(alpha, view)) + (SPEC_MARGIN + MIN_ALBEDO),
         interface_albedo(interface, cos_theta_i),
+        leaving(alpha, view, inverse * inverse),
     )
+
+
+def leaving(alpha: Float, cos: Float, cone: Float) -> Float:
+    """An estimate of the part of a specular lobe's light that leaves through a smooth interface, where the rest is
+    reflected back down. `cos` is the cosine of the view below the interface, and `cone` is 1 / eta^2, the part of
+    diffuse light that leaves.
+
+    A sharp lobe leaves if its mirror direction does, and of a wide lobe, a part leaves that is in proportion to `cone`.
+    The constants are fitted to 3000 random lobes, for which the estimate is wrong by .034 on average.
+    """
+    # The squared cosine of the mirror direction above the interface, times `cone`; negative if it does not leave.
+    mirror = cone - (1.0 - cos * cos)
+    width = (3.35 * alpha + 0.0013) * cone
+    sharp = 0.5 + 0.5 * mirror / ops.sqrt(width * width + mirror * mirror)
+    wide = alpha / (alpha + 0.3)
+    return ops.maximum(ops.lerp(sharp, 0.71 * cone, wide), 0.05)
 
 
 def interface_albedo(interface: Interface, cos: Float) -> Float:

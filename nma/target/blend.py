@@ -131,10 +131,10 @@ def sample(blend: Blend, wi: Vec3, u_lobe: Float, u1: Float, u2: Float) -> tuple
 
 
 def lobe_probabilities(blend: Blend, cos_theta_i: Float) -> tuple[LobeProbabilities, ...]:
-    """The probability of each lobe of each instance: the instance's weight times the lobe's albedo bound, divided by
-    the sum over all lobes."""
+    """The probability of each lobe of each instance: the instance's weight times an estimate of the lobe's albedo,
+    divided by the sum over all lobes."""
     means = [
-        LobeProbabilities(ops.mean(a.diffuse), ops.mean(a.spec), a.clearcoat)
+        LobeProbabilities(ops.mean(a.diffuse), ops.mean(a.spec) * a.leaving, a.clearcoat)
         for a in albedos_of(blend, cos_theta_i)
     ]
     total = sum(w * (m.diffuse + m.spec + m.clearcoat) for w, m in zip(blend.weights, means, strict=True))

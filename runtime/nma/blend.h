@@ -89,18 +89,19 @@ struct Sample {
 // it receives.
 template <class T, class Albedo>
 inline void share_out(Blend<T>& blend, bool bounded, const Albedo& albedos_of) {
-    // Lanes 0 to 2 of `sum` hold the albedo of the blend in red, green and blue. Lane 3 holds the sum of these three
-    // albedos, which is three times the sum of all probabilities before they are normalised.
+    // Lanes 0 to 2 of `sum` hold the albedo of the blend in red, green and blue. Lane 3 holds the sum of all
+    // probabilities before they are normalised.
     Lanes<T> sum(T(0));
     for (int n = 0; n < blend.used(); ++n) {
         Pack<T>& pack = blend.packs[n];
         const Albedos<Lanes<T>> a = albedos_of(pack.instances);
         const Lanes<T> w = pack.weights;
-        pack.probabilities = {w * mean(a.diffuse), w * mean(a.spec), w * a.clearcoat};
+        LobeProbabilities<Lanes<T>>& o = pack.probabilities;
+        o = {w * mean(a.diffuse), w * mean(a.spec) * a.leaving, w * a.clearcoat};
         const Vec3<Lanes<T>> albedo = (a.diffuse + a.clearcoat + a.spec) * w;
-        sum += sums(albedo.x, albedo.y, albedo.z, albedo.x + albedo.y + albedo.z);
+        sum += sums(albedo.x, albedo.y, albedo.z, o.diffuse + o.spec + o.clearcoat);
     }
-    const Lanes<T> inverse = Lanes<T>(T(1), T(1), T(1), T(3)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0)));
+    const Lanes<T> inverse = Lanes<T>(T(1)) / maximum(sum, Lanes<T>(T(1), T(1), T(1), T(0)));
     const Lanes<T> share = inverse[3];
     for (int n = 0; n < blend.used(); ++n) {
         LobeProbabilities<Lanes<T>>& o = blend.packs[n].probabilities;

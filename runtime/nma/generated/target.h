@@ -95,12 +95,14 @@ struct Crossing {
     T pdf;
 };
 
-// Upper bounds of the directional albedo of each lobe of an instance.
+// Upper bounds of the directional albedo of each lobe of an instance, and an estimate of the part of the specular
+// lobe's light that leaves through the interface above.
 template <class T>
 struct Albedos {
     Vec3<T> diffuse;
     Vec3<T> spec;
     T clearcoat;
+    T leaving;
 };
 
 // A rotation about the normal, given by the cosine and sine of the azimuth that the rotation maps to 0.
@@ -487,7 +489,8 @@ template <class T>
 inline Albedos<T> lobe_albedos(const Principled<T>& p, T cos_theta_i) {
     const auto weight = schlick_weight<T>(cos_theta_i);
     return Albedos<T>{diffuse_albedo<T>(p, cos_theta_i, weight) + MIN_ALBEDO<T>,
-                      spec_albedo<T>(p, cos_theta_i) + MIN_ALBEDO<T>, clearcoat_albedo<T>(p, cos_theta_i, weight)};
+                      spec_albedo<T>(p, cos_theta_i) + MIN_ALBEDO<T>, clearcoat_albedo<T>(p, cos_theta_i, weight),
+                      T(1.0)};
 }
 
 // The bound of the interface's own lobe: a bound of the masking, times the reflectance of a typical facet.
@@ -503,16 +506,29 @@ inline T interface_albedo(const Interface<T>& interface, T cos) {
     return fresnel * unmasked + INTERFACE_MARGIN<T>;
 }
 
+// An estimate of the part of a specular lobe's light that leaves through a smooth interface, where the rest is
+// reflected back down. `cos` is the cosine of the view below the interface, and `cone` is 1 / eta^2, the part of
+// diffuse light that leaves.
+template <class T>
+inline T leaving(T alpha, T cos, T cone) {
+    const auto mirror = cone - (T(1.0) - cos * cos);
+    const auto width = (T(3.35) * alpha + T(0.0013)) * cone;
+    const auto sharp = T(0.5) + T(0.5) * mirror / sqrt(width * width + mirror * mirror);
+    const auto wide = alpha / (alpha + T(0.3));
+    return maximum(lerp(sharp, T(0.71) * cone, wide), T(0.05));
+}
+
 // The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
 // interface's own lobe. The bounds ignore the light that is lost on the way out.
 template <class T>
 inline Albedos<T> lobe_albedos_below(const Principled<T>& p, const Interface<T>& interface, T cos_theta_i) {
     const auto [alpha_x, alpha_y] = spec_alpha<T>(p.roughness, p.anisotropic);
-    const auto below = cos_below<T>(cos_theta_i, interface.eta, T(1.0) / interface.eta);
-    const auto unmasked = unmasked_albedo<T>(minimum(alpha_x, alpha_y), cos_shifted<T>(below, p.shift));
+    const auto alpha = minimum(alpha_x, alpha_y);
+    const auto inverse = T(1.0) / interface.eta;
+    const auto view = cos_shifted<T>(cos_below<T>(cos_theta_i, interface.eta, inverse), p.shift);
     return Albedos<T>{p.base_color * (T(1.0) - p.metallic) + MIN_ALBEDO<T>,
-                      p.base_color * (p.metallic * unmasked) + (SPEC_MARGIN<T> + MIN_ALBEDO<T>),
-                      interface_albedo<T>(interface, cos_theta_i)};
+                      p.base_color * (p.metallic * unmasked_albedo<T>(alpha, view)) + (SPEC_MARGIN<T> + MIN_ALBEDO<T>),
+                      interface_albedo<T>(interface, cos_theta_i), leaving<T>(alpha, view, inverse * inverse)};
 }
 
 // A direction with density cos(theta) / pi.
