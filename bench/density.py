@@ -27,7 +27,7 @@ import nma
 import nma.render
 from bench import frames, scenes
 from figures import common
-from nma.render.load import DEFAULT_ADAPTER
+from nma.adapter import DEFAULT_ADAPTER
 
 SIGMAS = (0.0, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 MATERIAL = {"alpha_top": 0.1, "alpha_bottom": 0.2, "eta_top": 1.5, "albedo": [0.99, 0.98, 0.97]}

@@ -26,7 +26,7 @@ import nma
 from bench import frames, scenes
 from figures import common
 from nma import network
-from nma.render.load import DEFAULT_ADAPTER
+from nma.adapter import DEFAULT_ADAPTER
 
 SUBJECT = "worn silver"
 

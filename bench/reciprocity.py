@@ -1,6 +1,6 @@
 """Measures how far adapters are from being reciprocal: the difference between f(wi, wo) and f(wo, wi).
 
-python -m bench.reciprocity [--adapter layered3-5x64] [--samples 65536] [--quick] [--output out/bench]
+python -m bench.reciprocity [--adapter layered3-3x32] [--samples 65536] [--quick] [--output out/bench]
 
 An adapter's network computes the blend's parameters for the view direction, so f(wi, wo) and f(wo, wi) differ. Paths
 from the camera use f(wi, wo), paths from a light would use f(wo, wi). This bench needs no renderer: it averages f(wi,
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import nma
 from bench import frames
-from nma.adapter import Adapter
+from nma.adapter import DEFAULT_ADAPTER, Adapter
 from nma.evaluate.reciprocity import swapped_pairs
 
 COSINES = (0.9, 0.5, 0.2)
@@ -44,7 +44,7 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--adapter", default="layered3-5x64")
+    parser.add_argument("--adapter", default=DEFAULT_ADAPTER)
     parser.add_argument("--samples", type=int, default=1 << 16, help="pairs of directions for each figure")
     parser.add_argument(
         "--quick", action="store_true", help="few pairs and two materials, to see that the bench works"

@@ -44,7 +44,7 @@ from nma.render.load import load_dict
 from nma.render.progressive import render_passes
 from nma.render.scene import material_coverage
 
-ADAPTERS = ("layered3-5x64", "layered3-3x32")
+ADAPTERS = ("layered3-3x32", "layered3-5x64")
 COLUMNS = "  ".join(
     (
         f"{'scene':9} {'bsdf':19} {'time s':>7} {'ratio':>6} {'cpu s':>6} {'ratio':>6} {'compile s':>9}",

@@ -100,7 +100,7 @@ def stand_in(subject: Subject) -> dict[str, Any]:
 
 def short(name: str) -> str:
     """Returns the size of the network from an adapter's name: layered3-5x64 -> 5x64."""
-    return name.split("-")[-1]
+    return name.partition("-")[2]
 
 
 def unseen(count: int, seed: int = 92) -> list[Subject]:

@@ -1,7 +1,7 @@
 """Fig. 1 of the paper: a textured scene, rendered by simulation and by the adapter at equal samples per pixel.
 
 python -m bench.teaser [--variant scalar_rgb] [--size 288] [--spp 64] [--runs 3] [--reference-spp 2048]
-    [--adapter layered3-5x64] [--rr-depth 5] [--quick] [--output out/bench]
+    [--adapter layered3-3x32] [--rr-depth 5] [--quick] [--output out/bench]
 
 The scene has three shader balls with textured materials, so the network runs at every shading point. A table below the
 pictures shows, for simulation and adapter, the median time of a frame, the variance, the squared error and the SMAPE
@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import frames, scenes
+from nma.adapter import DEFAULT_ADAPTER
 from nma.images.metrics import errors
 from nma.images.sheet import Row, contact_sheet
-from nma.render.load import DEFAULT_ADAPTER
 
 ENLARGED = 4
 Figures = Mapping[str, Mapping[str, Any]]

@@ -2,7 +2,7 @@
 // point.
 //
 //     g++ -std=c++17 -O2 -Iruntime runtime/example.cpp -o example
-//     ./example nma/adapter/trained/layered3-5x64.safetensors
+//     ./example nma/adapter/trained/layered3-3x32.safetensors
 #include "nma.h"
 
 #include <cstdio>

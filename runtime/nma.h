@@ -1,7 +1,7 @@
 // Neural Material Adapter: renders expensive materials as blends of Principled BRDFs, whose parameters a tiny network
 // computes.
 //
-//     const nma::Adapter adapter = nma::Adapter::load("layered3-5x64.safetensors");
+//     const nma::Adapter adapter = nma::Adapter::load("layered3-3x32.safetensors");
 //     adapter.clamp(parameters);                                         // or refuse them: adapter.check(parameters)
 //     const nma::Brdf brdf = adapter.prepare(parameters, wi);            // once per shading point
 //     const nma::Value v = brdf.eval_pdf(wi, wo);                        // f cos(theta_o) [1/sr] and pdf [1/sr]

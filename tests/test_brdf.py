@@ -99,9 +99,10 @@ def test_the_coats_reflectance_divides_by_zero_at_no_direction(eta):
     columns = LAYERED3.sample(np.random.default_rng(0), 1)[0]
     columns[2] = eta
     wi = Vec3(np.sqrt(1 - z * z), 0 * z, z)
+    adapter = Adapter.load("layered3-3x32")
     with np.errstate(divide="raise", invalid="raise"):
-        made = Adapter.load("layered3-3x32").prepare([np.full(len(z), x) for x in columns], wi)
-    assert np.isfinite(target.numbers(made.blend)).all()
+        made = adapter.prepare([np.full(len(z), x) for x in columns], wi)
+    assert np.isfinite(target.numbers(made.blend, adapter.target)).all()
 
 
 @pytest.mark.parametrize("azimuth", AZIMUTHS)
@@ -247,5 +248,5 @@ def test_arguments_that_do_not_fit_are_refused():
     for params, cosines in ((columns, 0.5), (np.ones((2, 2, 13)), [0.5]), (np.ones(13), [[0.5]])):
         with pytest.raises(ParamError, match=r"needs parameters \(m, 13\) and cosines \(n,\)"):
             adapter.numbers(params, cosines)
-    alone = adapter.prepare([0.2] * 13, Vec3(0.0, 0.0, 1.0))
+    alone = adapter.prepare([float(c[0]) for c in columns], Vec3(0.0, 0.0, 1.0))
     assert np.isfinite(alone.eval(Vec3(0.0, 0.0, 1.0), Vec3(0.0, 0.6, 0.8)).x)

@@ -14,7 +14,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from adapter_cases import random_adapter
-from weights_cases import changed, header_of, packed, ranged, stored
+from weights_cases import FIRST, changed, header_of, packed, ranged, stored
 
 from nma.adapter import Adapter
 from nma.errors import ParamError, WeightsError
@@ -38,7 +38,7 @@ OTHER_PARAMS = (
 )
 
 
-TARGET = header_of("layered3-3x32")[1]["target"]
+TARGET = header_of(FIRST)[1]["target"]
 BASE_COLOR = TARGET[0]
 
 
@@ -47,21 +47,21 @@ def shifted(places, gap=b""):
 
     The header adds `places` bytes to the offset of every tensor.
     """
-    header, about, data = header_of("layered3-3x32")
+    header, about, data = header_of(FIRST)
     for entry in (entry for name, entry in header.items() if name != "__metadata__"):
         entry["data_offsets"] = [places + at for at in entry["data_offsets"]]
     return packed(header, about, gap + data)
 
 
 def of_integers(name):
-    header, about, data = header_of("layered3-3x32")
+    header, about, data = header_of(FIRST)
     header[name]["dtype"] = "I32"
     return packed(header, about, data)
 
 
 def with_more(tensor):
     """Returns a weights file with one additional tensor at its end."""
-    header, about, data = header_of("layered3-3x32")
+    header, about, data = header_of(FIRST)
     extra = {"dtype": tensor.dtype.str.replace("<f", "F").replace("4", "32").replace("8", "64")}
     extra |= {"shape": list(tensor.shape), "data_offsets": [len(data), len(data) + tensor.nbytes]}
     return packed(header | {"more": extra}, about, data + tensor.tobytes())
@@ -69,10 +69,10 @@ def with_more(tensor):
 
 def nested(depth):
     """Returns a weights file whose metadata is nested `depth` levels deep, by its training record."""
-    _, about, _ = header_of("layered3-3x32")
+    _, about, _ = header_of(FIRST)
     about["training"] = "HERE"
     text = json.dumps(about).replace('"HERE"', '{"a": ' * (depth - 1) + "1" + "}" * (depth - 1))
-    header, _, data = header_of("layered3-3x32")
+    header, _, data = header_of(FIRST)
     return packed(header, text, data)
 
 
@@ -81,33 +81,33 @@ def nested(depth):
     "data, message",
     [
         (b"", "too short"),
-        (stored("layered3-3x32")[:1000], "truncated"),
-        (stored("layered3-3x32")[:-4], "does not lie within the file"),
+        (stored(FIRST)[:1000], "truncated"),
+        (stored(FIRST)[:-4], "does not lie within the file"),
         (b"\xff" * 100, "truncated"),
         (struct.pack("<Q", 2) + b"{}", "__metadata__"),
         (struct.pack("<Q", 3) + b'{"a', "a string without an end"),
         (struct.pack("<Q", 60) + b"[" * 60, "nested too deep"),
-        (changed("layered3-3x32", format=2), "format"),
-        (changed("layered3-3x32", encoding="new"), "unknown input encoding 'new'"),
-        (changed("layered3-3x32", dialect="cycles"), "dialect 'cycles'"),
-        (changed("layered3-3x32", instances=1), "does not fit its description"),
-        (changed("layered3-3x32", hidden=[32, 32, 31]), "hidden layers"),
-        (changed("layered3-3x32", hidden="many"), "'hidden'"),
-        (changed("layered3-3x32", target=[]), "target parameters must have a base_color, and no name twice"),
-        (changed("layered3-3x32", target=[BASE_COLOR]), "does not fit its description"),
-        (changed("layered3-3x32", target=[*TARGET[:3], *TARGET[1:]]), "base_color, and no name twice"),
+        (changed(FIRST, format=2), "format"),
+        (changed(FIRST, encoding="new"), "unknown input encoding 'new'"),
+        (changed(FIRST, dialect="cycles"), "dialect 'cycles'"),
+        (changed(FIRST, instances=1), "does not fit its description"),
+        (changed(FIRST, hidden=[32, 32, 31]), "hidden layers"),
+        (changed(FIRST, hidden="many"), "'hidden'"),
+        (changed(FIRST, target=[]), "target parameters must have a base_color, and no name twice"),
+        (changed(FIRST, target=[BASE_COLOR]), "does not fit its description"),
+        (changed(FIRST, target=[*TARGET[:3], *TARGET[1:]]), "base_color, and no name twice"),
         # `sheen` occurs twice and `sheen_tint` is missing. The number of outputs is still correct, so the file passes
         # the check of this number.
         (
-            changed("layered3-3x32", target=[*TARGET[:6], TARGET[5], *TARGET[7:]]),
+            changed(FIRST, target=[*TARGET[:6], TARGET[5], *TARGET[7:]]),
             "base_color, and no name twice",
         ),
-        (changed("layered3-3x32", encoding="azimuth"), "does not fit its description"),
+        (changed(FIRST, encoding="azimuth"), "does not fit its description"),
         (
-            changed("layered3-3x32", encoding="azimuth", target=[BASE_COLOR, IN_PLANE]),
+            changed(FIRST, encoding="azimuth", target=[BASE_COLOR, IN_PLANE]),
             "lobes stretch along the plane of incidence",
         ),
-        (changed("layered3-3x32", encoding="azimuth", directional=False), "does not read the view direction"),
+        (changed(FIRST, encoding="azimuth", directional=False), "does not read the view direction"),
     ],
 )
 def test_inconsistent_files_are_refused(tmp_path, data, message):

@@ -162,7 +162,7 @@ def test_files_of_tables_name_the_class(bare, nma):
     [
         (
             "render steel.toml",
-            "the adapter layered3-5x64 is for class layered3; choose an adapter of class bare",
+            "the adapter layered3-3x32 is for class layered3; choose an adapter of class bare",
         ),
         (
             "render steel.toml --model layered",

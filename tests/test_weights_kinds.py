@@ -6,7 +6,7 @@ import re
 import struct
 
 import pytest
-from weights_cases import changed, header_of, packed, ranged, stored
+from weights_cases import FIRST, changed, header_of, packed, ranged, stored
 
 from nma.adapter import Adapter
 from nma.errors import WeightsError
@@ -15,7 +15,7 @@ from nma.native.runtime import Runtime
 
 def written(old, new):
     """Returns a weights file in whose metadata the text `old` is replaced by `new`, once."""
-    header, about, data = header_of("layered3-3x32")
+    header, about, data = header_of(FIRST)
     text = json.dumps(about)
     assert old in text
     return packed(header, text.replace(old, new, 1), data)
@@ -23,14 +23,14 @@ def written(old, new):
 
 def without(name):
     """Returns a weights file whose metadata lacks a field."""
-    header, about, data = header_of("layered3-3x32")
+    header, about, data = header_of(FIRST)
     del about[name]
     return packed(header, about, data)
 
 
 def tensor_twice():
     """Returns a weights file whose header has the entry of one tensor twice."""
-    data = stored("layered3-3x32")
+    data = stored(FIRST)
     size = struct.unpack("<Q", data[:8])[0]
     entry = '"layer0.bias": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}, '
     text = ("{" + entry).encode() + data[9 : 8 + size]
@@ -40,17 +40,17 @@ def tensor_twice():
 KINDS = {
     "a flag is 1": ranged("target", 2, in_plane=1),
     "a flag is null": ranged("target", 2, in_plane=None),
-    "a flag is text": changed("layered3-3x32", bounded="true"),
-    "bounded is 1": changed("layered3-3x32", bounded=1),
-    "bounded is null": changed("layered3-3x32", bounded=None),
-    "directional is 1": changed("layered3-3x32", directional=1),
-    "reciprocal is null": changed("layered3-3x32", reciprocal=None),
-    "format is true": changed("layered3-3x32", format=True),
-    "format is 1.0": changed("layered3-3x32", format=1.0),
-    "instances is 2.0": changed("layered3-3x32", instances=2.0),
-    "instances is text": changed("layered3-3x32", instances="2"),
-    "hidden has fractions": changed("layered3-3x32", hidden=[32.0, 32.0, 32.0]),
-    "hidden has truths": changed("layered3-3x32", hidden=[True, 32, 32]),
+    "a flag is text": changed(FIRST, bounded="true"),
+    "bounded is 1": changed(FIRST, bounded=1),
+    "bounded is null": changed(FIRST, bounded=None),
+    "directional is 1": changed(FIRST, directional=1),
+    "reciprocal is null": changed(FIRST, reciprocal=None),
+    "format is true": changed(FIRST, format=True),
+    "format is 1.0": changed(FIRST, format=1.0),
+    "instances is 2.0": changed(FIRST, instances=2.0),
+    "instances is text": changed(FIRST, instances="2"),
+    "hidden has fractions": changed(FIRST, hidden=[32.0, 32.0, 32.0]),
+    "hidden has truths": changed(FIRST, hidden=[True, 32, 32]),
     "a size is true": ranged("parameters", 0, size=True),
     "a size is 3.0": ranged("target", 0, size=3.0),
     "a low end is false": ranged("target", 2, low=False),
@@ -59,34 +59,30 @@ KINDS = {
     ),
     "a scale is null": ranged("target", 2, scale=None),
     "a name is a list": ranged("target", 2, name=["metallic"]),
-    "the class is a number": changed("layered3-3x32", class_name=3),
-    "the target is an object": changed("layered3-3x32", target={}),
-    "the training is a list": changed("layered3-3x32", training=[]),
-    "skip is 1": changed("layered3-3x32", skip=1),
-    "skip is null": changed("layered3-3x32", skip=None),
-    "the last layer does not read the inputs": changed("layered3-3x32", skip=True),
-    "the interface is null": changed("layered3-3x32", interface=None),
-    "the interface is text": changed("layered3-3x32", interface="alpha_top"),
-    "the interface is an object": changed("layered3-3x32", interface={"alpha_top": "eta_top"}),
-    "the interface has one name": changed("layered3-3x32", interface=["alpha_top"]),
-    "the interface has three names": changed("layered3-3x32", interface=["alpha_top", "eta_top", "sigma_t"]),
-    "the interface has numbers": changed("layered3-3x32", interface=[0, 2]),
-    "the interface has lists": changed("layered3-3x32", interface=[["alpha_top"], ["eta_top"]]),
-    "the interface has an unknown name": changed("layered3-3x32", interface=["alpha_top", "eta"]),
-    "the interface has a colour": changed("layered3-3x32", interface=["alpha_top", "eta_conductor"]),
-    "the interface has its names in the wrong order": changed(
-        "layered3-3x32", interface=["eta_top", "alpha_top"]
-    ),
-    "a width may be 0": changed("layered3-3x32", interface=["sigma_t", "eta_top"]),
+    "the class is a number": changed(FIRST, class_name=3),
+    "the target is an object": changed(FIRST, target={}),
+    "the training is a list": changed(FIRST, training=[]),
+    "skip is 1": changed(FIRST, skip=1),
+    "skip is null": changed(FIRST, skip=None),
+    "the last layer does not read the inputs": changed(FIRST, skip=True),
+    "the interface is null": changed(FIRST, interface=None),
+    "the interface is text": changed(FIRST, interface="alpha_top"),
+    "the interface is an object": changed(FIRST, interface={"alpha_top": "eta_top"}),
+    "the interface has one name": changed(FIRST, interface=["alpha_top"]),
+    "the interface has three names": changed(FIRST, interface=["alpha_top", "eta_top", "sigma_t"]),
+    "the interface has numbers": changed(FIRST, interface=[0, 2]),
+    "the interface has lists": changed(FIRST, interface=[["alpha_top"], ["eta_top"]]),
+    "the interface has an unknown name": changed(FIRST, interface=["alpha_top", "eta"]),
+    "the interface has a colour": changed(FIRST, interface=["alpha_top", "eta_conductor"]),
+    "the interface has its names in the wrong order": changed(FIRST, interface=["eta_top", "alpha_top"]),
+    "a width may be 0": changed(FIRST, interface=["sigma_t", "eta_top"]),
     "an interface is missing": ranged("target", 5, name="veil"),
-    "an encoding needs the direction": changed(
-        "layered3-3x32", encoding="layered3_bounce", directional=False
-    ),
+    "an encoding needs the direction": changed(FIRST, encoding="layered3_bounce", directional=False),
     "a field of the target is unknown": ranged("target", 2, colour=1),
-    "a field is unknown": changed("layered3-3x32", colour=1),
+    "a field is unknown": changed(FIRST, colour=1),
     "the format is missing": without("format"),
     "the direction is missing": without("directional"),
-    "a number is NaN": changed("layered3-3x32", training={"loss": math.nan}),
+    "a number is NaN": changed(FIRST, training={"loss": math.nan}),
     "a number is too large": written('"training": {', '"training": {"loss": 1e400, '),
     "a number starts with 0": written('"low": 0.0', '"low": 00.0'),
     "a number has a plus": written('"low": 0.0', '"low": +0.0'),
@@ -116,7 +112,7 @@ def test_both_readers_refuse_values_of_another_kind(tmp_path, fault):
 )
 def test_both_readers_accept_an_interface_of_a_width_and_an_index(tmp_path, fields):
     path = tmp_path / "good.safetensors"
-    path.write_bytes(changed("layered3-3x32", **fields))
+    path.write_bytes(changed(FIRST, **fields))
     assert (Adapter.load(path).interface or ()) == tuple(fields["interface"])
     Runtime(path)
 
@@ -151,7 +147,7 @@ def test_names_of_a_file_are_shortened_and_have_no_escape_codes(tmp_path, name):
         (Runtime, ("encoding", "dialect")),
     ):
         for fault in faults:
-            path.write_bytes(changed("layered3-3x32", **{fault: name}))
+            path.write_bytes(changed(FIRST, **{fault: name}))
             with pytest.raises(WeightsError) as told:
                 reader(path)
             assert str(told.value).isprintable() and len(str(told.value)) < 400, (reader, fault)

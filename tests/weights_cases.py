@@ -2,8 +2,12 @@
 
 import json
 import struct
+from pathlib import Path
 
 from nma.adapter import weights_file
+
+# A file of the first version, a 3x32 network whose target is a blend of two Principled BRDFs.
+FIRST = Path(__file__).with_name("data") / "first-version.safetensors"
 
 
 def stored(name):
@@ -11,7 +15,7 @@ def stored(name):
 
 
 def header_of(name):
-    """Returns the parts of a shipped weights file: the header, the adapter's metadata, and the bytes of the tensors."""
+    """Returns the parts of a weights file: the header, the adapter's metadata, and the bytes of the tensors."""
     data = stored(name)
     size = struct.unpack("<Q", data[:8])[0]
     header = json.loads(data[8 : 8 + size])
@@ -32,6 +36,6 @@ def changed(name, **fields):
 
 def ranged(group, number, **fields):
     """Returns a weights file with a changed declaration of a parameter, in the group `parameters` or `target`."""
-    about = header_of("layered3-3x32")[1]
+    about = header_of(FIRST)[1]
     about[group][number] |= fields
-    return changed("layered3-3x32", **{group: about[group]})
+    return changed(FIRST, **{group: about[group]})

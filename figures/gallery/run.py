@@ -25,11 +25,12 @@ import nma
 import nma.render
 from figures import common
 from nma import materials
+from nma.adapter import DEFAULT_ADAPTER
 from nma.images.metrics import errors
 from nma.images.sheet import PAPER, Row, contact_sheet
 from nma.render.demo import worn_silver
 from nma.render.fireflies import clamped
-from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
+from nma.render.load import load_dict, material_bsdf
 from nma.render.progressive import render_passes, sampler
 
 Image = NDArray[np.float32]

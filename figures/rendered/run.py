@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 import nma
 import nma.render
 from figures import common, studio
+from nma.adapter import DEFAULT_ADAPTER
 from nma.cli.console import progress
 from nma.files import write_text
 from nma.images.metrics import METRICS
@@ -278,10 +279,9 @@ def sheet(
     materials: list[nma.materials.Material],
     path: Path,
 ) -> None:
-    """Writes a sheet with pictures of ROWS materials, from the largest to the median HDR-FLIP of the best adapter."""
+    """Writes a sheet with pictures of ROWS materials, from the default adapter's largest HDR-FLIP to its median."""
     shown = [name for name in flips if name != AGAIN]
-    best = nma.shipped()[-1]
-    chosen = studio.worst_to_median(flips[best]["flip_hdr"], ROWS)
+    chosen = studio.worst_to_median(flips[DEFAULT_ADAPTER]["flip_hdr"], ROWS)
     caption = partial("HDR {:.4f}, LDR {:.4f}".format)
     lines = [
         Row(
@@ -291,7 +291,7 @@ def sheet(
         )
         for m in chosen
     ]
-    note = f"FLIP; rows by that of {best}, worst first"
+    note = f"FLIP; rows by that of {DEFAULT_ADAPTER}, worst first"
     contact_sheet(path, lines, [SIMULATION, *shown], title="Rendered error on unseen materials", note=note)
 
 

@@ -22,10 +22,11 @@ import numpy as np
 import nma
 import nma.render
 from figures import common
+from nma.adapter import DEFAULT_ADAPTER
 from nma.images.metrics import difference_image
 from nma.images.sheet import Row, contact_sheet
 from nma.render.demo import DEPTH, FLIP_SCALE, TEXTURE_SCALE
-from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
+from nma.render.load import load_dict, material_bsdf
 from nma.render.progressive import render_passes
 from nma.render.textures import bitmap_texture, procedural_textures
 

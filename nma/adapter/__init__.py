@@ -3,6 +3,6 @@
 The folder `trained` contains the shipped adapters.
 """
 
-from nma.adapter.adapter import Adapter, shipped, weights_file
+from nma.adapter.adapter import DEFAULT_ADAPTER, Adapter, shipped, weights_file
 
-__all__ = ["Adapter", "shipped", "weights_file"]
+__all__ = ["DEFAULT_ADAPTER", "Adapter", "shipped", "weights_file"]

@@ -34,6 +34,8 @@ from nma.target.interface import Interface
 from nma.target.plane import Plane
 from nma.target.principled import DIALECT
 
+# The name of the shipped adapter that is used if none is given.
+DEFAULT_ADAPTER = "layered3-3x32"
 _SHIPPED = files("nma.adapter").joinpath("trained")
 # Two parameter values count as equal if their relative difference is less than SAME, because single precision rounds
 # values.

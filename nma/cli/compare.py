@@ -36,7 +36,7 @@ def compare(
     exposure: Annotated[
         float, options.exposure("Stops that brighten the images for ssim, flip_ldr and the PNG.")
     ] = 0.0,
-    adapter: options.AdapterName = "layered3-5x64",
+    adapter: options.AdapterName = options.DEFAULT_ADAPTER,
     clamp: options.Clamp = False,
     changes: options.Changes = None,
     camera: options.Camera = "hero",

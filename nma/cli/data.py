@@ -75,7 +75,7 @@ def merl(
         typer.Option(
             help="The adapter of named materials and material files: a shipped adapter's name or a weights file."
         ),
-    ] = "layered3-5x64",
+    ] = options.DEFAULT_ADAPTER,
     clamp: options.Clamp = False,
 ) -> None:
     """Write any isotropic material as a MERL file: 90 x 90 x 180 values over half and difference angles.

@@ -17,7 +17,7 @@ def register(app: typer.Typer) -> None:
 
 def demo(
     output: Annotated[Path, options.output("The PNG to write.", ".png")] = Path("out/demo.png"),
-    adapter: options.AdapterName = "layered3-5x64",
+    adapter: options.AdapterName = options.DEFAULT_ADAPTER,
     size: options.Size = "256",
     spp: Annotated[int, options.samples("Samples per pixel of the frames that are timed.")] = 64,
     runs: Annotated[

@@ -31,7 +31,7 @@ def render(
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="nma: the adapter. layered: the reference.")] = "nma",
-    adapter: options.AdapterName = "layered3-5x64",
+    adapter: options.AdapterName = options.DEFAULT_ADAPTER,
     clamp: options.Clamp = False,
     changes: options.Changes = None,
     camera: options.Camera = "hero",

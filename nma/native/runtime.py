@@ -1,6 +1,6 @@
 """Calls the C++ runtime from Python for many queries at once. The first call compiles the runtime as a shared library.
 
-    runtime = nma.native.runtime.Runtime("layered3-5x64")
+    runtime = nma.native.runtime.Runtime("layered3-3x32")
     brdfs = runtime.prepare(params, wi)                        # (n, columns of the class), (n, 3)
     value, pdf = runtime.eval_pdf(brdfs, wi, wo)               # (n, 3) [1/sr], (n,) [1/sr]
     wo, value, pdf = runtime.sample(brdfs, wi, u)

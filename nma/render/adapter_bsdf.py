@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from nma.adapter import Adapter, shipped, weights_file
+from nma.adapter import DEFAULT_ADAPTER, Adapter, shipped, weights_file
 from nma.ops import Color, Vec3, select
 from nma.render.bsdf import define_base, mean_of_samples, over, vec3
 from nma.render.curves import MIN_COS, Curves
@@ -26,7 +26,6 @@ from nma.render.inputs import of_adapter
 from nma.render.paths import scene_path
 from nma.target import Brdf, numbers
 
-DEFAULT_ADAPTER = "layered3-5x64"
 ALBEDO_POINTS = 128
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nma import materials
+from nma.adapter import DEFAULT_ADAPTER
 from nma.images.metrics import difference_image, errors, flip_map
 from nma.images.sheet import Row, contact_sheet
 from nma.materials import Material
-from nma.render.load import DEFAULT_ADAPTER, load_dict, material_bsdf
+from nma.render.load import load_dict, material_bsdf
 from nma.render.progressive import render_passes, sampler
 from nma.render.scene import preview_scene
 from nma.render.statistics import Measurement, measure, render_seconds

@@ -8,11 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from nma.adapter import DEFAULT_ADAPTER
 from nma.errors import NmaError, ParamError, either, one_line
 from nma.images.io import check_size
 from nma.materials import Material, Texture
 from nma.params import LAYERED3
-from nma.render.adapter_bsdf import DEFAULT_ADAPTER, load_once
+from nma.render.adapter_bsdf import load_once
 from nma.render.textures import bitmap_texture
 
 # The file extensions of the image formats that Mitsuba reads.

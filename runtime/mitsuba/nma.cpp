@@ -75,7 +75,7 @@ private:
     }
 
     static std::string adapter_name(const Properties& props) {
-        return std::string(props.get<std::string_view>("adapter", "layered3-5x64"));
+        return std::string(props.get<std::string_view>("adapter", "layered3-3x32"));
     }
 
     // The parameters that the BSDF reads are those of the adapter's class. If the adapter was fitted to a single
