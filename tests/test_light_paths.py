@@ -17,6 +17,8 @@ from nma.render.textures import bitmap_texture
 
 nma.render.use("llvm_ad_rgb")
 MATERIAL = {"type": "nma", "adapter": "layered3-3x32", "material": "frosted-silver"}
+# An adapter that is so far from reciprocal that pictures show it.
+LOPSIDED = {**MATERIAL, "adapter": "layered3-principled-5x64"}
 STRETCHED = {**MATERIAL, "adapter": "stretched.safetensors"}
 TEXTURED = {**STRETCHED, "sigma_t": bitmap_texture(np.full((2, 2, 1), 0.3))}
 PLAIN = {"type": "nma", **NUMBERS}
@@ -109,7 +111,7 @@ def scene(integrator):
                 "radius": 0.3,
                 "emitter": {"type": "area", "radiance": 50.0},
             },
-            "plate": {"type": "rectangle", "bsdf": MATERIAL},
+            "plate": {"type": "rectangle", "bsdf": LOPSIDED},
         }
     )
 

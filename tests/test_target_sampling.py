@@ -103,13 +103,17 @@ def drawn(cases, count, seed, sampler):
 def draw(cases, count, seed, alpha_scale=1.0):
     """Draws samples of the blends.
 
-    An `alpha_scale` other than 1 makes the samples wrong, because it multiplies the widths of specular lobes.
+    An `alpha_scale` other than 1 makes the samples wrong, because it multiplies the widths of specular lobes, and of the
+    interface's own lobe.
     """
 
     def sampler(blend, wi, lane, u):
         rough = float(np.sqrt(alpha_scale))
         off = tuple(p._replace(roughness=p.roughness * rough) for p in blend.instances)
-        wo, _, pdf = target.sample(blend._replace(instances=off), wi, *u)
+        above = blend.interface
+        if above is not None:
+            above = above._replace(alpha=above.alpha * alpha_scale)
+        wo, _, pdf = target.sample(blend._replace(instances=off, interface=above), wi, *u)
         return wo, pdf > 0
 
     return drawn(cases, count, seed, sampler)
