@@ -103,8 +103,8 @@ def drawn(cases, count, seed, sampler):
 def draw(cases, count, seed, alpha_scale=1.0):
     """Draws samples of the blends.
 
-    An `alpha_scale` other than 1 makes the samples wrong, because it multiplies the widths of specular lobes, and of the
-    interface's own lobe.
+    An `alpha_scale` other than 1 makes the samples wrong, because it multiplies the widths of specular lobes, also of
+    the interface's own.
     """
 
     def sampler(blend, wi, lane, u):
