@@ -251,10 +251,10 @@ private:
         std::fill(slope + next, slope + output_count(), 1.0f);
     }
 
-    // Fills in `Preparation::outputs_of_lanes`. Fields that the network does not set, and lanes without an instance,
-    // get the index of the first output of the padding. `Network` pads the last layer by at least one neuron, so the
-    // padding has at least one output. The weights and the range of the padding are 0, so the decoded value of the
-    // padding is 0.
+    // Fills in `Preparation::outputs_of_lanes` and `outputs_of_pairs`. Fields that the network does not set, and lanes
+    // without an instance, get the index of the first output of the padding. `Network` pads the last layer by at least
+    // one neuron, so the padding has at least one output. The weights and the range of the padding are 0, so the
+    // decoded value of the padding is 0.
     void lay_out_lanes() {
         const int size = static_cast<int>(places_.size()), per_pack = Blend<float>::PRINCIPLED_SIZE * LANES;
         const int zero = output_count();
@@ -263,6 +263,9 @@ private:
             for (int f = 0; f < size; ++f)
                 outputs_of_lanes_[k / LANES * per_pack + places_[f] * LANES + k % LANES] = k * size + f;
         preparation_.outputs_of_lanes = outputs_of_lanes_.data();
+        for (int at = 0; at < per_pack; at += LANES)
+            outputs_of_pairs_.insert(outputs_of_pairs_.end(), {outputs_of_lanes_[at], outputs_of_lanes_[at + 1]});
+        preparation_.outputs_of_pairs = outputs_of_pairs_.data();
     }
 
     // A direction with the cosine `cos_theta_i` and the azimuth 0. Isotropic adapters read only z, so x is set to 0 for
@@ -301,6 +304,7 @@ private:
     Preparation preparation_{};
     std::vector<int> places_;            // for each number of an instance: its place in `Principled`
     std::vector<int> outputs_of_lanes_;  // `Preparation::outputs_of_lanes`
+    std::vector<int> outputs_of_pairs_;  // `Preparation::outputs_of_pairs`
     std::vector<std::size_t> owners_;    // for each number of the parameters: the index of the parameter
     std::unique_ptr<float[], detail::FreeAligned> ranges_;
     bool in_plane_ = false;

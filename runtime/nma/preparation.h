@@ -19,6 +19,9 @@ struct Preparation {
     // For each lane of each field of each pack, in the order of `Pack` in memory: the index of the decoded output that
     // the lane holds. A lane that holds no output has the index of an output of padding, whose value is 0.
     const int* outputs_of_lanes;
+    // The same for the first two lanes of the first pack, which are enough for a blend of one or two instances. With
+    // `outputs_of_lanes` for both, GCC computes the addresses of all lanes before it knows which of them are needed.
+    const int* outputs_of_pairs;
     // The indices of the interface's width and index of refraction in the parameters; null if the target does not lie
     // under an interface.
     const int* interface;
@@ -39,14 +42,15 @@ struct Indexed {
     Lanes<float> operator()(const int* index) const {
         return {numbers[index[0]], numbers[index[1]], numbers[index[2]], numbers[index[3]]};
     }
-    // The same if the last two lanes hold no instance.
+    // Reads two numbers. The last two lanes hold no instance.
     Lanes<float> pair(const int* index) const { return {numbers[index[0]], numbers[index[1]], 0.0f, 0.0f}; }
 };
 
-// Fills in all numbers of the instances of a pack. `read` reads the four numbers at an index of `outputs_of_lanes`.
-template <class Read>
+// Fills in all numbers of the instances of a pack. `read` reads the lanes of one number at an index of an array that
+// has STEP indices for each number.
+template <int STEP, class Read>
 inline void fill_instances(Pack<float>& pack, const int* index, const Read& read) {
-    NMA_UNROLL for (int f = 0; f < Blend<float>::PRINCIPLED_SIZE; ++f) pack.as_array()[f] = read(index + f * LANES);
+    NMA_UNROLL for (int f = 0; f < Blend<float>::PRINCIPLED_SIZE; ++f) pack.as_array()[f] = read(index + f * STEP);
 }
 
 // Fills in the interface above a blend, if there is one. If the adapter was fitted to a single material, `parameters`
@@ -72,8 +76,10 @@ inline void assemble(const Preparation& preparation, const float* parameters, co
     for (int n = 0; n < blend.used(); ++n) {
         Pack<float>& pack = blend.packs[n];
         const int* index = preparation.outputs_of_lanes + n * Blend<float>::PRINCIPLED_SIZE * LANES;
-        if (blend.count <= 2) fill_instances(pack, index, [&](const int* k) { return pick.pair(k); });
-        else fill_instances(pack, index, pick);
+        if (Pick::MOST > 0 || blend.count > 2) fill_instances<LANES>(pack, index, pick);
+        else
+            fill_instances<2>(pack, preparation.outputs_of_pairs,
+                              [&](const int* k) { return Indexed(numbers).pair(k); });
         float weights[LANES] = {};
         NMA_UNROLL for (int k = 0; k < LANES; ++k) {
             const int next = n * LANES + k + 1;

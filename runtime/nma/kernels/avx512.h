@@ -63,7 +63,6 @@ struct Few {
         std::memcpy(&found, &numbers, sizeof(found));
         return found;
     }
-    NMA_FN nma::Lanes<float> pair(const int* index) const { return (*this)(index); }
 };
 
 #include "body.inl"
