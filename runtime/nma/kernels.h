@@ -98,6 +98,7 @@ inline InstructionSet fastest() {
 // of a query are a row whose length is the padded width of the last layer, aligned to 64 bytes.
 struct Kernels {
     InstructionSet set;
+    int lanes;  // of its vectors
     // Runs the network for one query.
     void (*forward)(const NetworkView&, const float* inputs, float* outputs);
     // Runs the network for many queries, each of which has a row of inputs and a row of outputs.
@@ -119,6 +120,7 @@ struct Kernels {
 // The functions for `set`, or the portable functions if this CPU does not support `set`.
 inline const Kernels& kernels(InstructionSet set) {
     static constexpr Kernels PORTABLE{InstructionSet::portable,
+                                      portable::VEC_SIZE,
                                       portable::forward,
                                       portable::forward_many,
                                       portable::encode,
@@ -128,17 +130,19 @@ inline const Kernels& kernels(InstructionSet set) {
     if (!supported(set)) return PORTABLE;
 #if defined(NMA_X86)
     static constexpr Kernels AVX2{InstructionSet::avx2,
+                                  avx2::VEC_SIZE,
                                   avx2::forward,
                                   avx2::forward_many,
                                   avx2::encode,
                                   avx2::decode,
                                   avx2::set_lobe_probabilities,
                                   avx2::prepare<avx2::forward>};
-    static constexpr Kernels AVX512{InstructionSet::avx512, avx512::forward_any, avx512::forward_many,
-                                    avx512::encode,         avx512::decode,      avx512::set_lobe_probabilities,
-                                    avx512::prepare_any};
+    static constexpr Kernels AVX512{InstructionSet::avx512,         avx512::VEC_SIZE,   avx512::forward_any,
+                                    avx512::forward_many,           avx512::encode,     avx512::decode,
+                                    avx512::set_lobe_probabilities, avx512::prepare_any};
 #if !defined(NMA_NO_AVX512_BF16)
     static constexpr Kernels BF16{InstructionSet::avx512_bf16,
+                                  avx512_bf16::VEC_SIZE,
                                   avx512_bf16::forward,
                                   avx512_bf16::forward_many,
                                   avx512::encode,
@@ -151,6 +155,7 @@ inline const Kernels& kernels(InstructionSet set) {
     if (set == InstructionSet::avx512) return AVX512;
 #elif defined(NMA_ARM)
     static constexpr Kernels NEON{InstructionSet::neon,
+                                  neon::VEC_SIZE,
                                   neon::forward,
                                   neon::forward_many,
                                   neon::encode,

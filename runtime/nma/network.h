@@ -58,7 +58,7 @@ public:
                 throw Error("the network is too wide: this version runs at most " + std::to_string(WIDEST_LAYER) +
                             " inputs, neurons in a hidden layer, and " + std::to_string(WIDEST_LAYER - 1) + " outputs");
             LayerView& view = view_.layers[k];
-            view = {in, detail::padded(out, WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
+            view = {in, detail::padded(out, last ? kernels_->lanes : WIDTH_STEP), nullptr, nullptr, nullptr, nullptr};
             view.bias = keep(layers[k].bias, view.width);
             if (pairs) view.pairs = keep_pairs(layers[k], view);
             else view.columns = keep_columns(layers[k], view);

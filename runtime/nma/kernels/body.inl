@@ -72,15 +72,17 @@ NMA_FN inline void tile(const LayerView& layer, int first, const float* x, int x
 }
 
 // Computes all neurons of a layer from index `first` on, in tiles of VECTORS vectors. If fewer neurons remain than a
-// tile has, they are computed in tiles of half the size.
+// tile has, they are computed in smaller tiles.
 template <int VECTORS, int QUERIES, bool PAIRS>
 NMA_FN inline void tiles(const LayerView& layer, int first, const float* x, int x_stride, float* y, int y_stride,
                          bool relu) {
-    constexpr int SUMS = QUERIES > 1 || VECTORS >= 8 ? 1 : VECTORS >= 4 ? 2 : 4;
+    constexpr int SUMS = QUERIES * VECTORS >= 8 ? 1 : QUERIES * VECTORS >= 4 ? 2 : 4;
     for (; first + VECTORS * VEC_SIZE <= layer.width; first += VECTORS * VEC_SIZE)
         tile<VECTORS, QUERIES, SUMS, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
-    if constexpr (VECTORS * VEC_SIZE > WIDTH_STEP)
-        if (first < layer.width) tiles<VECTORS / 2, QUERIES, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
+    if constexpr (VECTORS > 1) {
+        constexpr int FEWER = VECTORS > 4 ? 4 : VECTORS - 1;
+        if (first < layer.width) tiles<FEWER, QUERIES, PAIRS>(layer, first, x, x_stride, y, y_stride, relu);
+    }
 }
 
 // Computes all layers of a network for QUERIES queries.

@@ -1,8 +1,7 @@
 // The weights of a network in memory, in the order in which the functions in kernels/ read them.
 //
 // `Network` (network.h) fills in `LayerView` and `NetworkView`, and `Adapter` (nma.h) fills in `Ranges`. Vectors have
-// 4, 8 or 16 lanes, depending on the instruction set. All widths in this file are multiples of 16, so that every
-// instruction set reads the same layout.
+// 4, 8 or 16 lanes, depending on the instruction set. All widths in this file are multiples of the count of lanes.
 #pragma once
 
 #include <cstdint>
@@ -14,9 +13,9 @@ namespace nma {
 constexpr int WIDEST_LAYER = 512;
 // The largest count of layers, including the output layer.
 constexpr int DEEPEST_NETWORK = 16;
-// WIDTH_STEP is the count of lanes of the widest vector. Every width is a multiple of WIDTH_STEP. INPUT_STEP is the
-// count of inputs that the inner loop of `tile` (body.inl) reads per step. Every count of inputs is a multiple of
-// INPUT_STEP.
+// WIDTH_STEP is the count of lanes of the widest vector. Every width is a multiple of WIDTH_STEP, except that of the
+// last layer, which is a multiple of the lanes of the instruction set's vectors. INPUT_STEP is the count of inputs that
+// the inner loop of `tile` (body.inl) reads per step. Every count of inputs is a multiple of INPUT_STEP.
 constexpr int WIDTH_STEP = 16, INPUT_STEP = 4;
 // The width of a narrow network. The activations of such a network fit in two vectors of 16 lanes and stay in
 // registers.
@@ -76,7 +75,7 @@ struct NetworkView {
 //     start[k] + slope[k] u + factor[k] 2^(rate[k] u)
 //
 // If in_plane[k] is 1 instead of 0, the decoded value is multiplied by sin^2(theta_i), which goes to 0 towards normal
-// incidence. The arrays have `count` numbers, a multiple of WIDTH_STEP. After the last output of the network, the
+// incidence. The arrays have `count` numbers, the width of the last layer. After the last output of the network, the
 // arrays have at least one zero. The numbers factor[k] are 0 for all k >= `logarithmic`. For these k, the decoding does
 // not compute the power of 2.
 struct Ranges {
