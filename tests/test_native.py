@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scalar_cases import plugins
 
-import nma
+import nma.render
 from nma import network
 from nma.adapter import encoding
 from nma.errors import MissingDependencyError, ParamError
@@ -104,6 +104,7 @@ def test_python_reaches_the_functions_for_batches(tmp_path):
 def test_beside_compiled_plugins_the_other_bsdfs_are_refused_with_advice(monkeypatch, tmp_path):
     """In scalar_rgb, `nma` and `layered` are compiled, and `values` says which variant it needs."""
     registered = {}
+    nma.render.use("llvm_ad_rgb")  # without a variant, Mitsuba has no `register_bsdf`
     monkeypatch.setattr("mitsuba.register_bsdf", registered.__setitem__)
     monkeypatch.setattr(register, "_add_resource", lambda folder: None)
     monkeypatch.setattr(build, "has_mitsuba_plugins", lambda: True)
