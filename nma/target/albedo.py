@@ -86,10 +86,12 @@ def leaving(alpha: Float, cos: Float, cone: Float) -> Float:
     """
     # The squared cosine of the mirror direction above the interface, times `cone`; negative if it does not leave.
     mirror = cone - (1.0 - cos * cos)
-    width = (3.35 * alpha + 0.0013) * cone
-    sharp = 0.5 + 0.5 * mirror / ops.sqrt(width * width + mirror * mirror)
-    wide = alpha / (alpha + 0.3)
-    return ops.maximum(ops.lerp(sharp, 0.71 * cone, wide), 0.05)
+    # Of a lobe of this reach, a part leaves that grows evenly from 0 to 1 while `mirror` grows by the reach.
+    reach = (8.44 * alpha + 0.0066) * cone
+    sharp = ops.minimum(ops.maximum(0.5 * reach + mirror, 0.0), reach)
+    # The mean of sharp / reach and .75 cone, with the weights .283 and alpha.
+    found = (0.283 * sharp + (0.75 * cone * alpha) * reach) / ((alpha + 0.283) * reach)
+    return ops.maximum(found, 0.05)
 
 
 def interface_albedo(interface: Interface, cos: Float) -> Float:

@@ -512,10 +512,10 @@ inline T interface_albedo(const Interface<T>& interface, T cos) {
 template <class T>
 inline T leaving(T alpha, T cos, T cone) {
     const auto mirror = cone - (T(1.0) - cos * cos);
-    const auto width = (T(3.35) * alpha + T(0.0013)) * cone;
-    const auto sharp = T(0.5) + T(0.5) * mirror / sqrt(width * width + mirror * mirror);
-    const auto wide = alpha / (alpha + T(0.3));
-    return maximum(lerp(sharp, T(0.71) * cone, wide), T(0.05));
+    const auto reach = (T(8.44) * alpha + T(0.0066)) * cone;
+    const auto sharp = minimum(maximum(T(0.5) * reach + mirror, T(0.0)), reach);
+    const auto found = (T(0.283) * sharp + T(0.75) * cone * alpha * reach) / ((alpha + T(0.283)) * reach);
+    return maximum(found, T(0.05));
 }
 
 // The bounds of all lobes of an instance under an interface, at cos(theta_i) > 0. `clearcoat` is the bound of the
