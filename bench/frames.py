@@ -182,6 +182,25 @@ def figures(frames: Frames, reference: Converged | None = None) -> dict[str, flo
     return found | {"error": float(errors.mean()), "doubt": float(doubt)}
 
 
+def gain(own: Frames, simulation: Frames) -> tuple[float, float | None]:
+    """Returns the efficiency by variance relative to the simulation, and its standard error if there are 3 frames.
+
+    The standard error is that of the ratio of variances. It is estimated by the jackknife, from the spread of the
+    ratio's logarithm when one frame is left out.
+    """
+
+    def log_ratio(kept: Array) -> float:
+        simulated, adapted = (f.pictures[kept].var(axis=0, ddof=1).mean() for f in (simulation, own))
+        return math.log(simulated / adapted)
+
+    runs = len(own.wall)
+    found = float(np.median(simulation.wall / own.wall)) * math.exp(log_ratio(np.full(runs, True)))
+    if runs < 3:
+        return found, None
+    spread = math.sqrt((runs - 1) * np.var([log_ratio(np.arange(runs) != left) for left in range(runs)]))
+    return found, found * spread
+
+
 def ratios(own: Row, simulation: Row) -> dict[str, Any]:
     """Returns time, variance, error and efficiencies divided by those of the simulation; an unknown ratio is None."""
     time, variance, error = (ratio(own[key], simulation[key]) for key in ("seconds", "variance", "error"))
