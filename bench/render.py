@@ -1,6 +1,7 @@
 """Time, variance and error of `principled`, `layered` and `nma` in the preview scene, with and without textures.
 
-    python -m bench.render [--size 256] [--spp 64] [--runs 5] [--reference-spp 1024] [--quick] [--output out/bench]
+    python -m bench.render [--size 256] [--spp 64] [--runs 12] [--reference-spp 1024] [--sampler multijitter]
+        [--quick] [--output out/bench]
 
 Every run renders one frame with each BSDF, so that other load on the machine slows all BSDFs alike. The columns are:
 
@@ -9,11 +10,17 @@ ratio       a frame's time relative to `principled` in the same round, median ov
 compile     extra time of the first frame over the second, with an empty cache of kernels and no other BSDF
 variance    variance of one frame over independent seeds, averaged over pixels and channels
 efficiency  1 / (variance x time)
+gain        efficiency relative to `layered`, with its standard error from leaving out one frame at a time (jackknife)
 bias        root mean square difference between the expected picture and the expected picture of `layered`
 smape       SMAPE between the mean of the frames and the reference; in the row of `layered`, this error is noise only
 
 The bias is estimated from products of independent renderings. If the squared bias is at most twice its standard error,
 the table shows an upper limit of the bias, marked with <.
+
+Frames have the sampler that `nma render` would choose, which is multi-jittered for most sample counts. The multi-
+jittered sampler spreads samples evenly over the choice of lights and lobes. An adapter makes few such choices, so that
+its variance falls more than that of `layered`, whose random walks make many. `--sampler independent` shows the
+variance without this effect.
 
 The machine's load average is printed before and after the table. `principled` shows another material, so only its time
 and its variance can be compared with the other BSDFs.
@@ -42,13 +49,14 @@ from nma.adapter import shipped
 from nma.images.metrics import errors
 from nma.render.load import load_dict
 from nma.render.progressive import render_passes
+from nma.render.progressive import sampler as best_sampler
 from nma.render.scene import material_coverage
 
 ADAPTERS = ("layered3-3x32", "layered3-5x64")
 COLUMNS = "  ".join(
     (
         f"{'scene':9} {'bsdf':19} {'time s':>7} {'ratio':>6} {'cpu s':>6} {'ratio':>6} {'compile s':>9}",
-        f"{'variance':>9} {'efficiency':>10} {'bias':>8} {'smape':>7}",
+        f"{'variance':>9} {'efficiency':>10} {'gain':>12} {'bias':>8} {'smape':>7}",
     )
 )
 
@@ -60,12 +68,15 @@ def main() -> None:
     coverage = material_coverage(size)
     print(
         f"frames   {arguments.size} x {arguments.size}, {arguments.spp} spp, path depth {scenes.DEPTH}, material on "
-        f"{coverage:.0%} of the pixels, {arguments.variant}; {arguments.runs} runs, reference "
-        f"{arguments.reference_spp} spp\n\n{COLUMNS}"
+        f"{coverage:.0%} of the pixels, {arguments.variant}, {arguments.sampler} sampler; "
+        f"{arguments.runs} runs, reference {arguments.reference_spp} spp\n\n{COLUMNS}"
     )
     rows = []
     for scene, bsdfs in subjects(arguments.adapter).items():
-        described = {name: scenes.preview(bsdf, size, arguments.rr_depth) for name, bsdf in bsdfs.items()}
+        described = {
+            name: sampled(scenes.preview(bsdf, size, arguments.rr_depth), arguments)
+            for name, bsdf in bsdfs.items()
+        }
         compilation = {name: compile_seconds(one, arguments.spp) for name, one in described.items()}
         measured = frames.in_turns(described, arguments.spp, range(arguments.runs))
         halves = converged_halves(described["layered"], arguments.reference_spp)
@@ -78,11 +89,16 @@ def main() -> None:
 
 
 def parse() -> argparse.Namespace:
-    parser = frames.parser(__doc__, size=256, spp=64, runs=5)
+    parser = frames.parser(__doc__, size=256, spp=64, runs=12)
     parser.add_argument("--reference-spp", type=int, default=1024)
     parser.add_argument("--adapter", nargs="*", default=ADAPTERS, help="shipped names or weights files")
+    parser.add_argument(
+        "--sampler", choices=("independent", "multijitter"), help="default: that of `nma render`"
+    )
     parser.add_argument("--variant", default=frames.VECTORISED)
-    return frames.parse(parser, size=32, spp=8, runs=2, reference_spp=32, adapter=ADAPTERS[-1:])
+    arguments = frames.parse(parser, size=32, spp=8, runs=2, reference_spp=32, adapter=ADAPTERS[-1:])
+    arguments.sampler = arguments.sampler or best_sampler(arguments.spp, arguments.size**2)
+    return arguments
 
 
 def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -105,6 +121,12 @@ def subjects(adapters: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
             **{f"nma {Path(name).stem}": scenes.adapter(worn, name) for name in adapters},
         },
     }
+
+
+def sampled(scene: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Returns the scene with the sampler and the samples per pixel of the command line."""
+    sensor = scene["sensor"] | {"sampler": {"type": arguments.sampler, "sample_count": arguments.spp}}
+    return scene | {"sensor": sensor}
 
 
 def compile_seconds(description: dict[str, Any], spp: int) -> float:
@@ -144,6 +166,7 @@ def row(scene: str, name: str, measured: dict[str, Frames], halves: list[Array])
         "cpu_ratio": float(np.median(own.cpu / principled.cpu)),
         "variance": variance,
         "efficiency": 1.0 / (variance * wall),
+        "gain": frames.gain(own, measured["layered"]),
         "all_seconds": own.wall.tolist(),
         "all_cpu": own.cpu.tolist(),
     }
@@ -174,9 +197,11 @@ def bias(row: dict[str, Any]) -> float | None:
 
 def line(row: dict[str, Any]) -> str:
     """Formats a row of the results as a line of the printed table."""
+    gain, error = row["gain"]
+    shown = f"{gain:.2f}" if error is None else f"{gain:.2f} ± {error:.2f}"
     text = (
         f"{row['scene']:9} {row['bsdf']:19} {row['seconds']:7.2f} {row['seconds_ratio']:6.2f} {row['cpu']:6.2f} "
-        f"{row['cpu_ratio']:6.2f} {row['compile']:9.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g}"
+        f"{row['cpu_ratio']:6.2f} {row['compile']:9.2f}  {row['variance']:9.2e} {row['efficiency']:10.3g} {shown:>12}"
     )
     if "squared_bias" not in row:
         return text + f" {'-':>8} {'-':>7}"

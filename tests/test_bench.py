@@ -48,6 +48,22 @@ def test_efficiency_is_the_inverse_of_noise_times_time():
     assert unknown["efficiency by error"] is None
 
 
+def test_the_gain_over_the_simulation_has_a_standard_error():
+    """Half the time and half the noise make the efficiency eight times as large. The error covers the truth."""
+    noise = np.random.default_rng(1).normal(size=(2, 12, 8, 8, 3))
+    simulation = frames.Frames(noise[0], np.full(12, 2.0), np.full(12, 2.0))
+    adapter = frames.Frames(0.5 * noise[1], np.full(12, 1.0), np.full(12, 1.0))
+    found, error = frames.gain(adapter, simulation)
+    # The variances have 11 x 192 degrees of freedom each, so the standard error is 8 sqrt(4 / 2112), or .35.
+    assert error == pytest.approx(0.35, rel=0.5)
+    assert abs(found - 8.0) < 3.0 * error
+    assert frames.gain(simulation, simulation) == (1.0, 0.0)
+    assert (
+        frames.gain(*(f._replace(pictures=f.pictures[:2], wall=f.wall[:2]) for f in (adapter, simulation)))[1]
+        is None
+    )
+
+
 def test_there_is_no_ratio_of_errors_that_are_not_positive():
     assert frames.ratio(-0.1, 0.4) is None
     assert frames.ratio(0.1, 0.0) is None
